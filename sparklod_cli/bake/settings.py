@@ -38,20 +38,17 @@ class BakeSettings:
         growth: of quality, the largest number of nodes for each leaf, 1.05 to 2.0.
         max_sh: the highest SH degree that is kept.
         selection: its coordinates are those of the input.
-        transform: of the splats that are kept; None for the identity.
-        up: axis of the input that points up, one of `scene.AXES`, which `transform` may have turned to another; None
-            for that of the file.
+        transform: of the selected splats; None for the identity.
+        up: axis of the input that points up, one of `scene.AXES`; None for that of the file.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         suffix: of the format, one of `WRITABLE` that holds trees.
-        encoding: of `codecs.formats.ENCODINGS`, to write arrays in that layout instead.
-        raw: write their words alone, rather than as .npz.
-        detail: of regions and detail levels, to write a Streamed SOG instead.
-        tiles: of tiles and where they stand, to write 3D Tiles instead.
+        encoding, raw: name in `codecs.formats.ENCODINGS`, to write arrays in that layout instead, as .npz or as words.
+        detail, tiles: to write a Streamed SOG, or 3D Tiles, instead.
         environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
-        environment_beyond: of a Streamed SOG, splats of the input farther out than this become its environment, see
-            `lod.detail_levels.beyond`; in the input's units. None for none.
-        simplify: how many splats a cut of the tree has, to write that without a tree instead.
-        refine: how merged splats are fitted to pictures of full detail, its cameras left out; None for not at all.
+        environment_beyond: of a Streamed SOG, distance beyond which splats become its environment, in the input's
+            units, see `lod.detail_levels.beyond`; None for none.
+        simplify: to write the splats of a cut, without a tree, instead.
+        refine: fitting of merged splats to pictures of full detail, without its cameras; None for none.
         camera_path: a file of training cameras, or of those by which a PSNR is measured, in the coordinates of the
             output; None for cameras that are placed around and inside the scene.
         converts: an input that has a tree keeps it, if its format is another one; otherwise it is refused.
@@ -109,29 +106,26 @@ class Resources:
 class Baked:
     """Result of a bake, which its steps fill in.
 
+    What other outputs, inputs or steps would have is None or empty.
+
     Attributes:
         output_format: "spz", "rad", "rad-chunked", "streamed-sog", "3d-tiles", the name of the encoding of arrays, or
             the name of the format of a simplified scene.
         bytes: size of all files of the output.
-        version, fractional_bits: of an SPZ output, else None.
-        chunks: of a RAD output, else None.
-        encodings: of a RAD output, by the field of `RadOptions`.
-        sh_codes: the most entries of the SH palette of a RAD output; None without one.
-        arrays: shapes of the arrays of another output, in its order.
-        detail, tiles, simplified: of a Streamed SOG, of 3D Tiles, and of a simplified scene, else None.
+        version, fractional_bits: of an SPZ output.
+        chunks, encodings, sh_codes: of a RAD output; its encodings by the field of `RadOptions`, and the most entries
+            of its SH palette.
+        arrays: shapes of the arrays of an output in a viewer's layout, in its order.
         clamped: number of nodes with a value that the output cannot hold, by column of `Splats`.
         clamps: at which ends of the range, and how far beyond.
         format, notes: of the input, for display.
         read: number of splats of the input, or of its nodes if it has a tree.
         splats: number of leaves.
-        sh_degree, nodes: of the tree.
+        sh_degree, nodes, levels: of the tree; levels are its depth plus 1.
         dropped: number of dropped splats by reason (`selection.REASONS`).
         method: builder of the tree; None for the tree of the input.
-        levels: depth plus 1.
         seconds: by stage (read, build, order, refine, arrange, levels, tiles, errors, simplify, encode, write).
-        refine: result of fitting merged splats; None without `--refine`.
-        blocks: number of blocks, out of core; None in memory.
-        scratch_bytes_written, scratch_bytes_read: in the scratch folder; None in memory.
+        blocks, scratch_bytes_written, scratch_bytes_read: of a bake out of core.
     """
 
     output_format: str = ""

@@ -34,16 +34,13 @@ class BuiltTree:
     """Tree on its way from the splats of an input to the files of an output.
 
     Attributes:
-        out, options: files of the output, and the options of its format.
         form: format of an SPZ or RAD file, which is written in windows; None for an output that is made of all nodes at
             once, in memory, and takes any tree.
         in_chunks: viewers read the output in chunks, for which nodes are ordered first.
-        stored: codes of unchanged nodes, which keep them; None for none.
-        before: (N,) nodes with these codes.
+        stored, before: codes that unchanged nodes keep, and (N,) nodes with these codes; None for none.
         repacked: RAD file whose chunks are copied; None for none.
         nodes: in memory or in a store; before the tree is built, the splats of an input in memory; None while a step
             replaces them.
-        baked: the result, which the steps fill in.
         environment: splats that are always drawn; None without.
         statistics: of all nodes, those by which the codec settles options; of the leaves alone before the nodes are in
             order; None for an output that needs none.

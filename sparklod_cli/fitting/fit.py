@@ -128,13 +128,11 @@ def fit(
 
     def run(device: str) -> tuple[Splats, Refined]:
         fitting = _Fitting(nodes, tree, dataclasses.replace(settings, device=device), fixed, threads, say)
-        is_complete = True
-        while fitting.has_steps:
+        while fitting.schedule.remaining:
             if not fitting.run_stage(progress, interrupted):
-                is_complete = False
-                break
+                return fitting.finish(is_complete=False)
             say(fitting.describe_stage())
-        return fitting.finish(is_complete)
+        return fitting.finish(is_complete=True)
 
     with on_threads(threads):
         try:
@@ -181,7 +179,7 @@ class _Fitting:
         self._held_out = list(itertools.islice(pictures(held_out, self.nodes), HELD_OUT))
         can_gain = bool(self._held_out) and self.nodes.fitted.size > 0
         self._training = list(itertools.islice(pictures(training, self.nodes), min(TRAINING, steps) * can_gain))
-        self._schedule = Schedule(steps if self._training else 0)
+        self.schedule = Schedule(steps if self._training else 0)
         self._examples = self._drawn(np.random.Generator(np.random.PCG64(seeds[2])))
         self._optimiser = _optimiser_on(settings.device, self.nodes, say)
         self._before = self._best = scores_of(self.nodes, self._held_out)
@@ -196,13 +194,9 @@ class _Fitting:
                 spread = (spread + GOLDEN) % 1
                 yield self._training[at], LEAST_SHARE * (MOST_SHARE / LEAST_SHARE) ** spread
 
-    @property
-    def has_steps(self) -> bool:
-        return self._schedule.remaining > 0
-
     def run_stage(self, progress: Progress, interrupted: Callable[[], bool]) -> bool:
         """Take the steps of a stage, and keep the nodes if they gained; return False if it was interrupted."""
-        schedule = self._schedule
+        schedule = self.schedule
         steps = schedule.stage_steps
         for picture, cut in self._with_cuts(itertools.islice(self._examples, steps)):
             if interrupted():
@@ -257,7 +251,7 @@ class _Fitting:
         after = self._lawful() if self._stages else self._before
         kept = float(self.nodes.changed()[self.nodes.fitted].mean()) if self.nodes.fitted.size else 0.0
         stages = tuple(self._stages)
-        report = Refined(self._schedule.done, stages, self._before, after, kept, is_complete, self._seed)
+        report = Refined(self.schedule.done, stages, self._before, after, kept, is_complete, self._seed)
         return self.nodes.result(), report
 
     def _lawful(self) -> Scores:

@@ -76,24 +76,23 @@ LESS_MEMORY = (
 )
 
 
-class Connection:
-    """Context manager with the `distributed.Client` of a cluster; reports lost workers to the user by `say`."""
+class ClusterEngine:
+    """Engine on a Dask cluster, which reports lost workers to the user by `say`.
 
-    def __init__(self, client: Any, say: Callable[[str], None]) -> None:
-        self.client, self.say = client, say
+    The client holds the graph: a task is submitted when all its needs are done. Workers return two numbers only, so a
+    lost worker takes no result with it: results are in the store.
+
+    Attributes:
+        client: the `distributed.Client` of the cluster.
+        memory: bytes that a task may take; None if unknown.
+    """
+
+    def __init__(self, client: Any, say: Callable[[str], None], *, threads: int, memory: int | None = None) -> None:
+        self.client, self.say, self.threads, self.memory = client, say, threads, memory
         self._losses: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
         self._starved = set[str]()
         self._alone_since: float | None = None
-
-    def __enter__(self) -> Connection:
-        for topic in TOPICS:
-            self.client.subscribe_topic(topic, self._keep)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.alive:
-            for topic in TOPICS:
-                self.client.unsubscribe_topic(topic)
+        self._checked: tuple[str, frozenset[str]] | None = None
 
     @property
     def alive(self) -> bool:
@@ -160,7 +159,7 @@ class Connection:
             return OutOfMemoryError(f"{name}: {error}; {LESS_MEMORY}")
         return error
 
-    def _keep(self, event: tuple[float, Any]) -> None:
+    def keep(self, event: tuple[float, Any]) -> None:
         """Record a message of the scheduler; called on the client's thread."""
         message = event[1]
         if not isinstance(message, dict):
@@ -169,94 +168,6 @@ class Connection:
             self._starved.add(str(message.get("worker")))
         elif message.get("action") == "remove-worker" and not message.get("expected"):
             self._losses.put(message)
-
-
-class Pool:
-    """Calls on a cluster that have not ended. A context manager, which cancels unfinished calls."""
-
-    def __init__(self, connection: Connection, stage: str) -> None:
-        self._connection = connection
-        self._prefix = f"{stage}-{uuid.uuid4().hex[:8]}"
-        self._calls = dict[str, tuple[int, tuple[Any, ...]]]()
-        self._futures = dict[str, Any]()
-        self._tries = dict[str, int]()
-        self._paused: list[tuple[float, str]] = []
-        self._ended: queue.SimpleQueue[str] = queue.SimpleQueue()
-
-    def __enter__(self) -> Pool:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._connection.tell_losses()
-        if self._futures and self._connection.alive:
-            with contextlib.suppress(Exception):  # the scheduler is gone by now
-                self._connection.client.cancel(list(self._futures.values()), force=True)
-
-    def __bool__(self) -> bool:
-        return bool(self._calls)
-
-    def submit(self, name: str, place: int, *call: Any) -> None:
-        """Submit a call of a function with arguments, by a unique name; calls with lower places come first."""
-        self._calls[name] = place, call
-        key = (f"{self._prefix}-{self._tries.get(name, 0)}", name)
-        with self._connection.guarded():
-            future = self._connection.client.submit(*call, key=key, pure=False, priority=-place)
-        self._futures[name] = future
-        future.add_done_callback(lambda _: self._ended.put(name))
-
-    def next(self) -> tuple[str, Any, Exception | None]:
-        """Wait for a call that ends; return its name, its result and its error, if it failed."""
-        while True:
-            due = [name for when, name in self._paused if when <= time.monotonic()]
-            self._paused = [each for each in self._paused if each[1] not in due]
-            for name in due:
-                place, call = self._calls[name]
-                self.submit(name, place, *call)
-            try:
-                name = self._ended.get(timeout=TICK)
-            except queue.Empty:
-                self._connection.look()
-                continue
-            status = self._futures[name].status
-            if status not in ENDED:  # its worker was lost since; the scheduler repeats it
-                self._connection.look()
-                loop = self._connection.client.loop
-                loop.add_callback(loop.call_later, TICK, self._ended.put, name)
-                continue
-            future = self._futures.pop(name)
-            if status == "finished":
-                with self._connection.guarded():
-                    result = future.result()
-                del self._calls[name]
-                return name, result, None
-            error = self._connection.failure(name, future)
-            if not self._is_worth_another(name, error):
-                del self._calls[name]
-                return name, None, error
-
-    def _is_worth_another(self, name: str, error: Exception) -> bool:
-        """Return whether a failed call is repeated; it is, after a pause."""
-        tried = self._tries.get(name, 0)
-        if not isinstance(error, OSError) or error.errno in LASTING or tried >= len(PAUSES):
-            return False
-        self._tries[name] = tried + 1
-        self._paused.append((time.monotonic() + PAUSES[tried], name))
-        return True
-
-
-class ClusterEngine:
-    """Engine on a Dask cluster.
-
-    The client holds the graph: a task is submitted when all its needs are done. Workers return two numbers only, so a
-    lost worker takes no result with it: results are in the store.
-
-    Attributes:
-        memory: bytes that a task may take; None if unknown.
-    """
-
-    def __init__(self, connection: Connection, *, threads: int, memory: int | None = None) -> None:
-        self._connection, self.threads, self.memory = connection, threads, memory
-        self._checked: tuple[str, frozenset[str]] | None = None
 
     def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress) -> None:
         """Run tasks as `Engine.run`."""
@@ -267,7 +178,7 @@ class ClusterEngine:
         progress(stage, done, total, "splat")
         if not left:
             return
-        here = str(store), frozenset(self._connection.workers())
+        here = str(store), frozenset(self.workers())
         if here != self._checked:  # new workers may have joined
             self.check(store)
             self._checked = here
@@ -277,7 +188,7 @@ class ClusterEngine:
         for name, names in needs.items():
             for need in names:
                 heirs.setdefault(need, []).append(name)
-        with Pool(self._connection, stage) as pool:
+        with Pool(self, stage) as pool:
 
             def submit(name: str) -> None:
                 place, task = left[name]
@@ -313,7 +224,7 @@ class ClusterEngine:
         Yields:
             the result of each call, in their order, or the `SparklodError` that it failed with.
         """
-        with Pool(self._connection, stage) as pool:
+        with Pool(self, stage) as pool:
             for place, each in enumerate(arguments):
                 pool.submit(str(place), place, functools.partial(call, threads=self.threads), *each)
             yield self._outcomes(pool, stage, len(arguments), progress, unit)
@@ -340,8 +251,8 @@ class ClusterEngine:
         if store is not None:
             store.put(name, {PROBE: np.arange(2)})
         try:
-            with self._connection.guarded():
-                answers = self._connection.client.run(probe, store, name, here, on_error="return")
+            with self.guarded():
+                answers = self.client.run(probe, store, name, here, on_error="return")
         finally:
             if store is not None:
                 store.remove(name)
@@ -357,9 +268,82 @@ class ClusterEngine:
     def remove(self, folder: Path) -> None:
         """Remove a folder on the machines of all workers, and on this one."""
         shutil.rmtree(folder, ignore_errors=True)
-        if self._connection.alive:
-            with contextlib.suppress(SparklodError), self._connection.guarded():
-                self._connection.client.run(shutil.rmtree, folder, ignore_errors=True)
+        if self.alive:
+            with contextlib.suppress(SparklodError), self.guarded():
+                self.client.run(shutil.rmtree, folder, ignore_errors=True)
+
+
+class Pool:
+    """Calls on a cluster that have not ended. A context manager, which cancels unfinished calls."""
+
+    def __init__(self, engine: ClusterEngine, stage: str) -> None:
+        self._engine = engine
+        self._prefix = f"{stage}-{uuid.uuid4().hex[:8]}"
+        self._calls = dict[str, tuple[int, tuple[Any, ...]]]()
+        self._futures = dict[str, Any]()
+        self._tries = dict[str, int]()
+        self._paused: list[tuple[float, str]] = []
+        self._ended: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._engine.tell_losses()
+        if self._futures and self._engine.alive:
+            with contextlib.suppress(Exception):  # the scheduler is gone by now
+                self._engine.client.cancel(list(self._futures.values()), force=True)
+
+    def __bool__(self) -> bool:
+        return bool(self._calls)
+
+    def submit(self, name: str, place: int, *call: Any) -> None:
+        """Submit a call of a function with arguments, by a unique name; calls with lower places come first."""
+        self._calls[name] = place, call
+        key = (f"{self._prefix}-{self._tries.get(name, 0)}", name)
+        with self._engine.guarded():
+            future = self._engine.client.submit(*call, key=key, pure=False, priority=-place)
+        self._futures[name] = future
+        future.add_done_callback(lambda _: self._ended.put(name))
+
+    def next(self) -> tuple[str, Any, Exception | None]:
+        """Wait for a call that ends; return its name, its result and its error, if it failed."""
+        while True:
+            due = [name for when, name in self._paused if when <= time.monotonic()]
+            self._paused = [each for each in self._paused if each[1] not in due]
+            for name in due:
+                place, call = self._calls[name]
+                self.submit(name, place, *call)
+            try:
+                name = self._ended.get(timeout=TICK)
+            except queue.Empty:
+                self._engine.look()
+                continue
+            status = self._futures[name].status
+            if status not in ENDED:  # its worker was lost since; the scheduler repeats it
+                self._engine.look()
+                loop = self._engine.client.loop
+                loop.add_callback(loop.call_later, TICK, self._ended.put, name)
+                continue
+            future = self._futures.pop(name)
+            if status == "finished":
+                with self._engine.guarded():
+                    result = future.result()
+                del self._calls[name]
+                return name, result, None
+            error = self._engine.failure(name, future)
+            if not self._is_worth_another(name, error):
+                del self._calls[name]
+                return name, None, error
+
+    def _is_worth_another(self, name: str, error: Exception) -> bool:
+        """Return whether a failed call is repeated; it is, after a pause."""
+        tried = self._tries.get(name, 0)
+        if not isinstance(error, OSError) or error.errno in LASTING or tried >= len(PAUSES):
+            return False
+        self._tries[name] = tried + 1
+        self._paused.append((time.monotonic() + PAUSES[tried], name))
+        return True
 
 
 #: Result of a probe, and its array.
@@ -500,8 +484,14 @@ def cluster(
                     f"{client.scheduler.address} asks for no credentials: anybody who reaches it can run programs on"
                     " its workers; docs/cluster.md says how to use TLS"
                 )
-        with Connection(client, say) as connection:
-            yield ClusterEngine(connection, threads=threads, memory=limit)
+        engine = ClusterEngine(client, say, threads=threads, memory=limit)
+        for topic in TOPICS:
+            client.subscribe_topic(topic, engine.keep)
+        try:
+            yield engine
+        finally:
+            for topic in TOPICS if engine.alive else ():
+                client.unsubscribe_topic(topic)
 
 
 @contextlib.contextmanager

@@ -115,11 +115,11 @@ def test_calls_side_by_side_give_results_and_failures_in_order(engine: ClusterEn
 
 
 def test_a_result_that_is_lost_with_its_worker_is_waited_for(engine: ClusterEngine) -> None:
-    with module.Pool(engine._connection, "baking") as pool:
+    with module.Pool(engine, "baking") as pool:
         pool.submit("twice", 0, functools.partial(made_up.twice, threads=1), 21)
         future = pool._futures["twice"]
         future.result(timeout=60)
-        loop, lost = engine._connection.client.loop, threading.Event()
+        loop, lost = engine.client.loop, threading.Event()
         loop.add_callback(future._state.lose)  # as when the scheduler hears that the worker is gone
         loop.add_callback(lost.set)
         assert lost.wait(60) and future.status == "lost"
@@ -159,7 +159,7 @@ class _Elsewhere(Store):
 
 
 def test_a_worker_without_sparklod_is_told_what_to_do(engine: ClusterEngine, job: Job) -> None:
-    client = engine._connection.client
+    client = engine.client
     client.wait_for_workers(2, timeout=60)  # one that another test killed may only now be replaced
     client.run(_hide, module.__name__)
     try:

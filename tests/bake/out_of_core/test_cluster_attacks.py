@@ -67,8 +67,8 @@ async def answered(security: Any, addresses: list[str], patience: float) -> list
 
 def test_no_port_answers_without_credentials(attacked: tuple[ClusterEngine, dict[int, int]], tmp_path: Path) -> None:
     engine, ports = attacked
-    assert set(ports.values()) == {os.getpid(), *engine._connection.client.run(os.getpid).values()}
-    own, tls = engine._connection.client.security, [f"tls://127.0.0.1:{port}" for port in ports]
+    assert set(ports.values()) == {os.getpid(), *engine.client.run(os.getpid).values()}
+    own, tls = engine.client.security, [f"tls://127.0.0.1:{port}" for port in ports]
     with module._quiet():
         assert asyncio.run(answered(own, tls, PATIENCE)) == tls  # nothing else listens
         assert asyncio.run(answered(distributed.Security.temporary(), tls, TRIES)) == []
@@ -89,7 +89,7 @@ def test_no_port_answers_a_browser(attacked: tuple[ClusterEngine, dict[int, int]
 
 
 def test_the_key_is_in_no_command_line_or_environment(attacked: tuple[ClusterEngine, dict[int, int]]) -> None:
-    key = attacked[0]._connection.client.security.tls_worker_key.splitlines()[1]
+    key = attacked[0].client.security.tls_worker_key.splitlines()[1]
     for pid in set(attacked[1].values()):
         process = psutil.Process(pid)
         assert key not in " ".join(process.cmdline())

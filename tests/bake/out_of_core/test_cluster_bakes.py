@@ -109,13 +109,13 @@ class Once:
 
 def test_a_worker_that_is_killed_changes_no_byte(two: ClusterEngine, tmp_path: Path) -> None:
     expected = baked(DEMO, tmp_path / "none.spz", BakeSettings(), None)
-    pids = list(two._connection.client.run(os.getpid).values())
+    pids = list(two.client.run(os.getpid).values())
     kill = Once(lambda: os.kill(pids[0], signal.SIGKILL))
     SAID.clear()
     assert baked(DEMO, tmp_path / "killed.spz", BakeSettings(), two, kill)[1] == expected[1]
     assert kill.acted
     for _ in range(600):  # the bake may have ended before the scheduler knew
-        two._connection.tell_losses()
+        two.tell_losses()
         if any("was lost" in text for text in SAID):
             break
         time.sleep(0.1)
