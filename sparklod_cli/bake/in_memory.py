@@ -160,14 +160,7 @@ def transformed(splats: Splats, settings: Transform | None, threads: int = 1) ->
 
 
 def split_environment(splats: Splats, distance: float) -> tuple[Splats, Splats | None]:
-    """Separate splats far outside of a scene, which become its environment; None without any.
-
-    Args:
-        distance: see `lod.detail_levels.beyond`.
-
-    Raises:
-        InvalidSplatsError: all splats are far outside.
-    """
+    """Separate splats `beyond` a distance, which become the environment of a scene; None without any."""
     from ..lod.detail_levels import beyond
 
     far = beyond(splats, distance)
@@ -175,11 +168,7 @@ def split_environment(splats: Splats, distance: float) -> tuple[Splats, Splats |
 
 
 def read_environment(settings: BakeSettings, threads: int, progress: Progress) -> Splats:
-    """Read the file of an environment, turned and moved as the scene.
-
-    Raises:
-        FormatError, InvalidSplatsError: it cannot be read, is a tree, or has invalid splats; names it.
-    """
+    """Read the file of an environment, turned and moved as the scene; errors name it."""
     path = settings.environment
     assert path is not None
     with naming(f"the environment {path}", (FormatError, InvalidSplatsError)):

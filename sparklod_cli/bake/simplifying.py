@@ -81,8 +81,7 @@ def count_for(
 ) -> tuple[int, float | None]:
     """Return the number of splats, at most `leaves`, that meets a goal, and their PSNR if the goal is a PSNR.
 
-    Raises:
-        FormatError: not even one splat fits.
+    Raise `FormatError` if not even one splat fits.
     """
     if goal.to is not None:
         return min(leaves, goal.to.of(leaves)), None
@@ -331,13 +330,7 @@ def refined(
 
 @dataclass(frozen=True, kw_only=True)
 class Extracted(Losses):
-    """Result of extracting the leaves of a tree.
-
-    Attributes:
-        format: of the input, for display.
-        nodes, splats: number of all nodes, and of the leaves.
-        seconds: by stage (read, write).
-    """
+    """Result of extracting the leaves of a tree: numbers of nodes and of leaves, and seconds by stage (read, write)."""
 
     format: str
     nodes: int
@@ -349,11 +342,7 @@ class Extracted(Losses):
 
 
 def leaves_of(scene: Scene) -> Scene:
-    """Return the splats that the tree of a scene was built of, as a scene without a tree.
-
-    Raises:
-        FormatError: it has no tree.
-    """
+    """Return the splats that a tree was built of, as a scene without a tree; raise `FormatError` without a tree."""
     if scene.tree is None:
         raise FormatError("it has no Level-of-Detail tree whose leaves could be written")
     leaves = scene.splats.take(scene.tree.is_leaf)
@@ -380,8 +369,7 @@ def extract_leaves(
 
     Raises:
         FormatError, OutputError: see `io.read_scene` and `io.scene_output`; the file has no tree.
-        InvalidSplatsError: a leaf is invalid.
-        OutOfMemoryError: it does not fit into memory.
+        InvalidSplatsError, OutOfMemoryError: a leaf is invalid, or all do not fit into memory.
     """
     with memory_errors_translated():
         form = WRITABLE[suffix]

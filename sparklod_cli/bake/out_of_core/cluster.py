@@ -218,7 +218,6 @@ class ClusterEngine:
 
         Args:
             call: function of a module that also takes `threads`, and returns something small.
-            arguments: small, and can be pickled.
             unit: word for a call in the progress.
 
         Yields:

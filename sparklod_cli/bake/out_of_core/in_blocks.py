@@ -138,11 +138,7 @@ class InBlocks:
         return functools.partial(encoded_array, job.store)
 
     def _scatter(self) -> InputSummary:
-        """Divide the scene into blocks and sort the splats of the input into them.
-
-        Raises:
-            InvalidSplatsError: no tree can be made of them.
-        """
+        """Divide the scene into blocks and sort the splats of the input into them."""
         job, block_splats, count = self.job, self.block_splats, self.job.stream.count
         part_splats = max(min(block_splats, PART_SPLATS), -(-count // MAX_PARTS))
         center, share = _sample_centers(job.stream, job.settings, -(-count // block_splats))
@@ -214,11 +210,9 @@ class InputSummary:
     """Counts, bounds, sample and statistics of the splats of an input.
 
     Attributes:
-        tallies: of selected and dropped splats, by part of the input.
-        beyond: number of selected splats that left the range of float32 when they were transformed.
-        bounds: of selected splats.
-        sample: even sample of selected splats.
-        statistics: of selected splats.
+        tallies: of selected and dropped splats, by part of the input; the rest is of selected splats.
+        beyond: number of splats that left the range of float32 when they were transformed.
+        sample: at an even stride.
     """
 
     tallies: Sequence[SelectionTally]

@@ -110,8 +110,7 @@ def _reason(
 ) -> str | None:
     """Return why a bake goes out of core, as the end of a sentence; None for one in memory.
 
-    Raises:
-        OutOfMemoryError: it would, but its output is made of a whole tree.
+    Raise `OutOfMemoryError` if it would, but its output is made of a whole tree.
     """
     needed = estimate.in_memory_bytes(settings, header.count, header.sh_degree)
     if memory is not None and needed > memory:
@@ -272,11 +271,7 @@ def _clear(store: Store) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a folder for one run; it and its parents are created if missing, and removed at the end if empty.
-
-    Raises:
-        ScratchError: another run is at work there, it is not a scratch folder, or it cannot be created.
-    """
+    """Lock a folder for one run; it and its parents are created if missing, and removed at the end if empty."""
     path = folder / LOCK
     with contextlib.ExitStack() as stack:
         try:
@@ -298,7 +293,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _opened_lock(path: Path) -> int:
-    """Create and lock the file; raise `ScratchError` if another run has locked it, or the folder is not ours."""
+    """Create and lock the file; raise `ScratchError` if another run has locked it, or the folder holds other files."""
     folder = path.parent
     with contextlib.suppress(FileNotFoundError):
         if not path.exists() and any(folder.iterdir()):
