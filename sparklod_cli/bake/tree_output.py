@@ -216,8 +216,8 @@ def write_whole(tree: BuiltTree, threads: int, progress: Progress, **how: Any) -
 
 def _repack(source: Place, out: Output, baked: Baked) -> None:
     """Write a RAD file with the chunks of another one."""
-    with opened(source) as (file, form, more), out:
-        chunks = form.codec().RadReader.open(file, **more)
+    with opened(source) as (file, form), out:
+        chunks = form.codec().RadReader.open(file.file, file.open_companion)
         name = out.target.name
         files = [(name, chunks.in_one_file())] if out.siblings is None else chunks.in_files(PurePath(name).stem)
         baked.bytes = sum(out.write(*each) for each in files)

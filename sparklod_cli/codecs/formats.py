@@ -44,8 +44,8 @@ class Format:
             yields the name and the bytes of each, this one last.
         trees: it can be written with a Level-of-Detail tree. Its `settled` then takes the `Statistics`, too, that
             `needed(options)` names; `encoder(scene, options, *, counting, threads, progress)` gives its
-            `encoder.Encoder`, and `stored(file, options)`, with `open_companion` where it has companions, the codes of
-            a file, for `Encoder.keeping`, and the options, which have the file's value where they leave a choice open.
+            `encoder.Encoder`, and `stored(source, options)` the codes of a file, for `Encoder.keeping`, and the
+            options, which have the value of the file where they leave a choice open.
         suffixes: lower case, with the dot.
         beginning: a regular expression that the first bytes of its files match; None for formats without one.
         keys: that its files have at the top level, which are JSON objects; empty if they are not. Without `beginning`

@@ -32,7 +32,7 @@ from ..system.threads import blocks_of, ordered_map
 from . import compression, quantize
 from .options import DEFAULT_SPZ_VERSION, DEFAULTS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WriteOptions
 from .quantize import ALL_BITS, Bytes
-from .reader import FileNote, OpenFile, Read, Reader, Scratch, Target, comment_of, read_comment, rows_of, size_of
+from .reader import FileNote, OpenFile, Read, Reader, Scratch, Target, comment_of, read_comment, rows_of
 
 if TYPE_CHECKING:
     from ..model.node_stream import NodeStream
@@ -687,13 +687,13 @@ def encode(
 StoredCodes = tuple[Layout, Mapping[str, Bytes]]
 
 
-def stored(file: BinaryIO, options: WriteOptions) -> tuple[StoredCodes, WriteOptions]:
+def stored(source: OpenFile, options: WriteOptions) -> tuple[StoredCodes, WriteOptions]:
     """Read the codes of a file; raises `FormatError` as `open_content`.
 
     Returns:
         the codes, and the options, which have the file's value where they leave a choice open.
     """
-    layout, rows, *_ = open_streams(file, size_of(file))
+    layout, rows, *_ = open_streams(source.file, source.size)
     codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams()}
     for each, part, some in rows:
         codes[each.name][part] = some

@@ -182,13 +182,14 @@ def inspect(
 
 def _surveyed(path: Path, check: bool, threads: int, progress: Progress) -> HeaderScan | None:
     """Return facts and findings from the headers of a file; None for formats of one part."""
-    with opened(path) as (file, form, more):
-        if form.name == RAD:
-            return headers.survey_rad(file, more["open_companion"], check=check)
-        if form.parts is None:
+    with opened(path) as (source, form):
+        if form.name != RAD and form.parts is None:
             return None
+        assert source.open_companion is not None
+        if form.parts is None:
+            return headers.survey_rad(source.file, source.open_companion, check=check)
         survey = {"levels": headers.survey_streamed_sog, "tiles": headers.survey_tiles}[form.parts]
-        return survey(file, more["open_companion"], check=check, threads=threads, progress=progress)
+        return survey(source.file, source.open_companion, check=check, threads=threads, progress=progress)
 
 
 def _of_blocks(

@@ -7,12 +7,13 @@ import functools
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from ..codecs.formats import RAD
 from ..codecs.rad.codec import RadChunk, read_chunk
 from ..codecs.rad.rad_header import RadHeader, header_violations, read_header
 from ..codecs.rad.rad_reader import RadReader, decoded_bytes, file_of
+from ..codecs.reader import OpenFile
 from ..codecs.rules import check_rules
 from ..model.file_coding import FileCoding
 from ..model.lod_tree import LodTree
@@ -40,13 +41,13 @@ class RadFile:
     @classmethod
     def open(cls, path: Path) -> RadFile | None:
         """Read the header of a file, and its palette; None for another format. Raises as `read_rad_header`."""
-        with opened(path) as (file, form, more):
-            return cls.of(path, file, more["open_companion"]) if form.name == RAD else None
+        with opened(path) as (source, form):
+            return cls.of(path, source) if form.name == RAD else None
 
     @classmethod
-    def of(cls, path: Path, file: BinaryIO, open_companion: Any) -> RadFile:
+    def of(cls, path: Path, source: OpenFile) -> RadFile:
         """Read the header of an open file, and its palette; the file may be closed afterwards. Raises as `open`."""
-        reader = RadReader.open(file, open_companion)
+        reader = RadReader.open(source.file, source.open_companion)
         return cls(path, reader.header, reader)
 
     @property
@@ -87,8 +88,8 @@ class RadFile:
 
     @contextlib.contextmanager
     def _reopened(self) -> Iterator[RadReader]:
-        with opened(self.path) as (file, _, more):
-            yield self._reader.reopened(file, more["open_companion"])
+        with opened(self.path) as (source, _):
+            yield self._reader.reopened(source.file, source.open_companion)
 
 
 def read_rad_header(path: Path) -> RadHeader:

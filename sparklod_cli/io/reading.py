@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..codecs.formats import FORMATS, RAW_SUFFIXES, ZIP, Format, head_of, lookalike_of, sniff
-from ..codecs.reader import OpenCompanion, OpenFile, Reader, Target
+from ..codecs.reader import OpenCompanion, OpenFile, Reader, Scratch, Target
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
 from ..system.addresses import Address, Place, absolute
@@ -114,32 +114,36 @@ def read_stored(path: Place, options: WriteOptions) -> tuple[Any, WriteOptions]:
     Returns:
         the codes, for `Encoder.keeping`, and the options, which have the file's value where they leave a choice open.
     """
-    with opened(path) as (file, form, more):
-        found: tuple[Any, WriteOptions] = form.codec().stored(file, options, **more)
+    with opened(path) as (source, form):
+        found: tuple[Any, WriteOptions] = form.codec().stored(source, options)
     return found
 
 
 def read_parts(path: Place, *, threads: int = 1, progress: Progress = silent) -> DetailScene | TileScene | None:
     """Read a scene with all its detail levels or tiles; None if its format has neither. Raises as `read_scene`."""
-    with opened(path) as (file, form, more):
+    with opened(path) as (source, form):
         if form.parts is None:
             return None
-        scene: DetailScene | TileScene = form.codec().decode_parts(file, threads=threads, progress=progress, **more)
+        scene: DetailScene | TileScene = form.codec().decode_parts(
+            source.file, threads=threads, progress=progress, open_companion=source.open_companion
+        )
     return scene
 
 
 @contextlib.contextmanager
-def opened(path: Place) -> Iterator[tuple[BinaryIO, Format, dict[str, Any]]]:
-    """Yield a splat file of any known format, the format, and more arguments for its codec.
+def opened(path: Place, threads: int = 1) -> Iterator[tuple[OpenFile, Format]]:
+    """Yield a splat file of any known format, and the format.
 
     Raises:
         FormatError: it is not a file, empty, or of no known format; an `OSError` of the body becomes one.
     """
     with readable(), contextlib.ExitStack() as closing:
-        yield open_splats(path, closing)
+        yield open_splats(path, closing, threads=threads)
 
 
-def open_splats(path: Place, closing: contextlib.ExitStack) -> tuple[BinaryIO, Format, dict[str, Any]]:
+def open_splats(
+    path: Place, closing: contextlib.ExitStack, scratch: Scratch | None = None, threads: int = 1
+) -> tuple[OpenFile, Format]:
     """As `opened`, until `closing` closes the file; an `OSError` is raised as it is."""
     if path.is_dir():
         path = in_folder(path)
@@ -164,7 +168,7 @@ def open_splats(path: Place, closing: contextlib.ExitStack) -> tuple[BinaryIO, F
             form = sniff(head := head_of(file), path.suffix)
             if form is None:
                 raise unknown_format(head, path)
-    return file, form, {"open_companion": open_companion} if form.companions else {}
+    return OpenFile(file, open_companion if form.companions else None, scratch, threads), form
 
 
 def unknown_format(head: bytes, path: Place) -> FormatError:
@@ -275,8 +279,8 @@ def _opened(
                 unpacked.append(OpenFile(closing.enter_context(file)))
         return unpacked[0]
 
-    file, form, more = open_splats(path, closing)
-    reader: Reader = form.codec().open_content(OpenFile(file, scratch=scratch, threads=threads, **more))
+    source, form = open_splats(path, closing, scratch, threads)
+    reader: Reader = form.codec().open_content(source)
     return dataclasses.replace(reader, threads=threads)
 
 

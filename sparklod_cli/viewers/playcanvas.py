@@ -295,10 +295,11 @@ class LoadedDetail(LoadedScene):
 
 def read_detail_files(path: Path) -> DetailFiles:
     """Return the files of a lod-meta.json, or of the folder that holds it; regions are in the order of the manifest."""
-    with opened(path) as (file, _, more):
-        data = file.read(MAX_MANIFEST + 1)
+    with opened(path) as (source, _):
+        assert source.open_companion is not None
+        data = source.file.read(MAX_MANIFEST + 1)
         manifest = parse(data)
-        requests = tuple(_bytes_of_files(more["open_companion"], name) for name in manifest.names())
+        requests = tuple(_bytes_of_files(source.open_companion, name) for name in manifest.names())
     layout = layout_of(manifest)
     of_run = np.full(layout.counts.shape, -1, np.int64)
     of_run[layout.region, layout.level] = layout.file

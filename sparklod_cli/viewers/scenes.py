@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..cameras.framing import Balls, balls_of
 from ..codecs.formats import PRECISIONS, RAD
-from ..codecs.reader import decode_file
+from ..codecs.reader import Reader
 from ..io import opened, size_of_input
 from ..lod.budget import Budget
 from ..model.gaussian import placed
@@ -434,22 +434,23 @@ def _read(
     Args:
         paged: precision of the pages of a file that is too large to be read at once; None to read it nevertheless.
     """
-    with naming(path), memory_errors_translated(), opened(path) as (file, form, more):
+    with naming(path), memory_errors_translated(), opened(path, threads) as (source, form):
         if paged is not None and form.name == RAD and path != DASH:
             from ..io.rad_file import RadFile
             from .paging import Pages
 
             with contextlib.suppress(FormatError):  # which is raised below
-                rad = RadFile.of(path, file, more["open_companion"])
+                rad = RadFile.of(path, source)
                 if not rad.fits and rad.header.lod_tree and rad.header.chunk_size == CHUNK_NODES:
                     nodes = functools.partial(nodes_of, precision=paged, threads=1)
                     return Pages(rad, str(path), nodes, threads)
         if form.parts is not None and path != DASH:
-            parts: DetailScene | TileScene = form.codec().decode_parts(file, threads=threads, progress=progress, **more)
+            parts: DetailScene | TileScene = form.codec().decode_parts(
+                source.file, threads=threads, progress=progress, open_companion=source.open_companion
+            )
             return parts
-        return decode_file(
-            form.codec(), file, threads=threads, progress=progress, columns=columns, validate=False, **more
-        )
+        reader: Reader = replace(form.codec().open_content(source), threads=threads)
+        return reader.scene(columns=columns, progress=progress, validate=False)
 
 
 def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:

@@ -13,7 +13,7 @@ from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.encoder import results
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.reader import decode_file
+from sparklod_cli.codecs.reader import OpenFile, decode_file
 from sparklod_cli.codecs.spz import like
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
@@ -58,7 +58,7 @@ def check(form: object, data: bytes, options: WriteOptions | None = None) -> Sce
     assert before.tree is not None
     kept = before.tree.is_leaf.copy()
     kept[1::3] = True
-    stored, like_file = codec.stored(io.BytesIO(data), options or WriteOptions())
+    stored, like_file = codec.stored(OpenFile(io.BytesIO(data)), options or WriteOptions())
     scene = dataclasses.replace(before, splats=others(before.splats, kept))
     settled = codec.settled(scene, like_file)
     encoder = codec.encoder(scene, settled).keeping(stored, kept)
@@ -106,7 +106,7 @@ def test_a_choice_of_another_coding_is_heeded() -> None:
     data = b"".join(spz.encode(scene))
     bits = decode_file(spz, io.BytesIO(data)).header["fractional_bits"]
     asked = WriteOptions(spz_version=2, fractional_bits=bits - 1)
-    stored, like_file = spz.stored(io.BytesIO(data), asked)
+    stored, like_file = spz.stored(OpenFile(io.BytesIO(data)), asked)
     assert like_file == asked
     encoder = spz.encoder(scene, spz.settled(scene, asked)).keeping(stored, np.ones(len(scene), bool))
     assert {*encoder.stored} == {"alphas", "colors", "scales", "sh"}
@@ -119,7 +119,7 @@ def test_a_rad_of_any_encodings_keeps_its_codes(given: RadOptions) -> None:
     scene = tree_of()
     options = rad.settled(scene, WriteOptions(rad=given))
     data = b"".join(rad.encode(scene, options))
-    _, like_file = rad.stored(io.BytesIO(data), WriteOptions())
+    _, like_file = rad.stored(OpenFile(io.BytesIO(data)), WriteOptions())
     after = check(rad, data)
     found = rad.settled(after, like_file).rad
     assert [getattr(found, name) for name in RAD_ENCODINGS] == [getattr(options.rad, name) for name in RAD_ENCODINGS]
@@ -149,7 +149,7 @@ def test_a_property_in_another_encoding_is_encoded_anew() -> None:
     scene = tree_of()
     data = b"".join(rad.encode(scene))
     before = decode_file(rad, io.BytesIO(data))
-    stored, like_file = rad.stored(io.BytesIO(data), WriteOptions(rad=RadOptions(rgb="f16")))
+    stored, like_file = rad.stored(OpenFile(io.BytesIO(data)), WriteOptions(rad=RadOptions(rgb="f16")))
     settled = rad.settled(before, like_file)
     assert settled.rad.rgb == "f16"
     encoder = rad.encoder(before, settled).keeping(stored, np.ones(len(before), bool))

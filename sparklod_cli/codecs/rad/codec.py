@@ -10,7 +10,7 @@ import math
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from .. import quantize, sh_palette, spark_codings
 from ..encoder import CLAMPED, CodeRange, Encoded, Windows, results, tally, windows_of
 from ..options import AUTO, DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..quantize import Bytes
-from ..reader import OpenCompanion, comment_of
+from ..reader import OpenFile, comment_of
 from ..spark_codings import SplatEncoding
 from .property_codings import BLOCK, BY_NAME, CODINGS, GZ, PROPERTIES, Property, Row, encodings_of
 from .rad_header import (
@@ -342,15 +342,13 @@ def _like(header: RadHeader, first: Mapping[str, Property], options: WriteOption
     return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, ranges=ranges))
 
 
-def stored(
-    file: BinaryIO, options: WriteOptions, *, open_companion: OpenCompanion | None = None
-) -> tuple[list[StoredChunk], WriteOptions]:
+def stored(source: OpenFile, options: WriteOptions) -> tuple[list[StoredChunk], WriteOptions]:
     """Read the codes of a file and of the files that it names.
 
     Returns:
         the codes, and the options, which have the file's value where they leave a choice open.
     """
-    reader, chunks = RadReader.open(file, open_companion), []
+    reader, chunks = RadReader.open(source.file, source.open_companion), []
     for packed in reader.packed():
         count, properties = packed.header.count, {each.name: each for each in packed.header.properties}
         codes = {}
