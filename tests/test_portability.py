@@ -98,7 +98,7 @@ def test_all_processors_are_used_where_no_affinity_is_known(monkeypatch: pytest.
 
 
 def test_memory_is_unknown_where_nothing_tells_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine, "_text", lambda path: None)
+    monkeypatch.setattr(machine, "_text", lambda path: "")
     monkeypatch.delattr(os, "sysconf", raising=False)
     assert (machine.total_memory(), machine.available_memory()) == (None, None)
 

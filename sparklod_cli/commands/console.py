@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from time import monotonic, time
 from types import TracebackType
@@ -146,21 +147,15 @@ class Console(contextlib.AbstractContextManager["Console"]):
         #: Begin and share of each stage of a job, 0 to 1, and how much of the job is done, which never falls.
         self._job: dict[str, tuple[float, float]] | None = None
         self._reached = 0.0
-        #: Its entry in `jit.listeners`, durations of compilations, the process that compiles ahead, and for which work.
-        self._listener: tuple[Callable[[str], None], Callable[[float], None], Callable[[str], None]] | None = None
+        #: Durations of compilations, and the process that compiles ahead.
         self._compiled: list[float] = []
         self._ahead: CompileAhead | None = None
-        self._work: str | BakeSettings | None = None
         self._troubles: set[str] = set()
+        self._stack = contextlib.ExitStack()
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.clear()
-        if self._ahead is not None:
-            self._ahead.close()
-        if self._listener is not None:
-            from ..system import jit
-
-            jit.listeners.remove(self._listener)
+        self._stack.close()
         if self._compiled:
             count = len(self._compiled) + (self._ahead.compiled if self._ahead is not None else 0)
             self.say(f"compiled {count_of(count, 'kernel')} in {sum(self._compiled):.1f} s")
@@ -264,20 +259,21 @@ class Console(contextlib.AbstractContextManager["Console"]):
         """
         from ..system import jit
 
-        self._work = work
-        self._listener = self._begin_compiling, self._end_compiling, self._say_trouble
-        jit.listeners.append(self._listener)
+        listener = functools.partial(self._begin_compiling, work), self._end_compiling, self._say_trouble
+        jit.listeners.append(listener)
+        self._stack.callback(jit.listeners.remove, listener)
 
-    def _begin_compiling(self, name: str) -> None:
+    def _begin_compiling(self, work: str | BakeSettings | None, name: str) -> None:
         from ..system import jit
         from ..warmup import CompileAhead, jobs_of, missing
 
         interrupts.leave_if_lost()
         if self._ahead is None:
             absent = missing()
-            self._ahead = CompileAhead(absent, [] if self._work is None else jobs_of(self._work), name)
-            advance = f"kept for later runs; sparklod warmup compiles all {len(absent)} in advance"
-            often = advance if jit.CACHE_FOLDER else "in every run: no cache can be written"
+            self._ahead = CompileAhead(absent, [] if work is None else jobs_of(work), name)
+            self._stack.callback(self._ahead.close)
+            often = f"kept for later runs; sparklod warmup compiles all {len(absent)} in advance"
+            often = often if jit.CACHE_FOLDER else "in every run: no cache can be written"
             self.say(f"Compiling kernels for this machine, up to a minute ({often}) ...")
         if self._bars:
             # How many a command needs is not known.

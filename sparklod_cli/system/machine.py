@@ -37,16 +37,16 @@ def processor_quota() -> float | None:
     """Return processor time that a container grants, in processors, such as 1.5; None without a limit."""
     found = []
     for folder in _groups("cpu"):
-        words = (_text(folder / "cpu.max") or "").split()  # version 2
+        words = _text(folder / "cpu.max").split()  # version 2
         if not words:
-            words = [_text(folder / f"cpu.cfs_{name}_us") or "" for name in ("quota", "period")]
+            words = [_text(folder / f"cpu.cfs_{name}_us") for name in ("quota", "period")]
         if len(words) == 2 and all(word.isdigit() for word in words) and int(words[1]):
             found.append(int(words[0]) / int(words[1]))
     return min(found, default=None)
 
 
 def _meminfo(name: str) -> int | None:
-    for line in (_text(Path("/proc/meminfo")) or "").splitlines():
+    for line in _text(Path("/proc/meminfo")).splitlines():
         words = line.split()
         if words[:1] == [f"{name}:"] and words[1].isdigit():
             return int(words[1]) * 1024
@@ -60,7 +60,7 @@ def _memory_limits() -> Iterator[tuple[int, int]]:
             ("memory.max", "memory.current"),  # version 2
             ("memory.limit_in_bytes", "memory.usage_in_bytes"),
         ):
-            limit, used = _text(folder / limit_name) or "", _text(folder / used_name) or ""
+            limit, used = _text(folder / limit_name), _text(folder / used_name)
             if limit.isdigit() and int(limit) < UNLIMITED:
                 yield int(limit), int(used) if used.isdigit() else 0
 
@@ -69,7 +69,7 @@ def _groups(controller: str) -> list[Path]:
     """Return the folders of the cgroups (versions 1 and 2) of this process, and of their ancestors."""
     root = Path("/sys/fs/cgroup")
     folders = {root, root / controller}  # in a container, its own group is the root
-    for line in (_text(Path("/proc/self/cgroup")) or "").splitlines():
+    for line in _text(Path("/proc/self/cgroup")).splitlines():
         number, _, rest = line.partition(":")
         names, _, path = rest.partition(":")
         if number == "0" or controller in names.split(","):
@@ -79,11 +79,11 @@ def _groups(controller: str) -> list[Path]:
     return sorted(folders)
 
 
-def _text(path: Path) -> str | None:
+def _text(path: Path) -> str:
     try:
         return path.read_text("utf-8", "replace").strip()
     except OSError:
-        return None
+        return ""
 
 
 def release_memory() -> None:

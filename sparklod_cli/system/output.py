@@ -177,13 +177,7 @@ class Output(contextlib.AbstractContextManager["Output"]):
                 if self._new is not None:
                     self._new.publish()
                 elif self._stage is not None:
-                    publish(
-                        self._stage,
-                        self._written,
-                        self.target.name,
-                        overwrite=self._overwrite,
-                        outdated=self._former,
-                    )
+                    publish(self._stage, self._written, self.target.name, self._overwrite, self._former)
                 elif isinstance(self.target, Address) and self._file is not None:
                     check_writable(self.target, overwrite=self._overwrite)
                     self._file.flush()
@@ -346,18 +340,14 @@ _STAGE = re.compile(r"\.sparklod-[0-9a-f]{16}\.parts")
 FORMER = "former"
 
 
-def lock(descriptor: int) -> None:
-    """Lock a file or folder until it is closed or its process ends; do nothing where there are no locks."""
-    if fcntl is not None:
-        with contextlib.suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+def lock(descriptor: int, *, wait: bool = True) -> bool:
+    """Lock a file or folder until it is closed or its process ends; return False if another process has locked it.
 
-
-def try_lock(descriptor: int) -> bool:
-    """Lock a file without waiting; return False if another process has locked it."""
+    Without `wait`, at once. Where there are no locks, return True.
+    """
     if fcntl is not None:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError:
             return False
         except OSError:  # a file system without locks
@@ -415,7 +405,6 @@ def write_atomically(target: Path, pieces: Iterable[bytes | memoryview], *, over
 
     Raises:
         FileExistsError: the file exists, and `overwrite` is not set.
-        OSError: the file system reported an error.
     """
     with contextlib.closing(NewFile(target, overwrite=overwrite)) as new:
         size = sum(map(new.file.write, pieces))
@@ -583,7 +572,7 @@ def staged(folder: Path) -> Iterator[Path]:
             os.close(descriptor)
 
 
-def publish(stage: Path, names: Collection[str], header: str, *, overwrite: bool, outdated: Iterable[str] = ()) -> None:
+def publish(stage: Path, names: Collection[str], header: str, overwrite: bool, outdated: Iterable[str]) -> None:
     """Give files that were added to a hidden folder their names beside it: all of them, or none.
 
     A former header is moved away before any other file is touched, and the new one is the last to get its name: for
@@ -599,7 +588,6 @@ def publish(stage: Path, names: Collection[str], header: str, *, overwrite: bool
     Raises:
         FileExistsError: a file exists, and `overwrite` is not set; or something else, such as a link, is in the place
             of a folder. The error has the path.
-        OSError: the file system reported an error.
     """
     folder, written = stage.parent, {*names}
     names = [*(name for name in names if name != header), header]
@@ -614,8 +602,6 @@ def publish(stage: Path, names: Collection[str], header: str, *, overwrite: bool
             (stage / FORMER).mkdir()
             for name in (header, *names[:-1], *gone):
                 _put_aside(stage, name)
-        else:
-            _refuse_existing(folder / name for name in names)
         for each in folders:
             (folder / each).mkdir(exist_ok=True)
         for name in names:
@@ -628,7 +614,7 @@ def publish(stage: Path, names: Collection[str], header: str, *, overwrite: bool
 
 
 def _folders_of(names: Iterable[str]) -> list[str]:
-    """Return the folders of files, outer folders first."""
+    """Return the folders of files, outermost first."""
     found = {str(parent) for name in names for parent in PurePosixPath(name).parents if parent.name}
     return sorted(found, key=lambda folder: (folder.count("/"), folder))
 
@@ -637,12 +623,6 @@ def _remove_empty(folders: Iterable[Path]) -> None:
     for folder in reversed(list(folders)):
         with contextlib.suppress(OSError):
             folder.rmdir()
-
-
-def _refuse_existing(paths: Iterable[Path]) -> None:
-    for path in paths:
-        if os.path.lexists(path):
-            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
 
 
 def _put_aside(stage: Path, name: str) -> None:

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -61,24 +61,19 @@ class _GuardedStream:
             return 0  # click probes streams this way, and ignores errors
         if isinstance(data, str):
             data = data.encode(self.encoding, self.errors).decode(self.encoding)
-        with self._translated_errors():
-            return self._stream.write(data)
+        return self._checked(self._stream.write, data)
 
     def flush(self) -> None:
         if self._stream is not None:
-            with self._translated_errors():
-                self._stream.flush()
+            self._checked(self._stream.flush)
 
-    @contextlib.contextmanager
-    def _translated_errors(self) -> Iterator[None]:
+    def _checked(self, method: Callable[..., Any], *arguments: Any) -> Any:
         try:
-            yield
+            return method(*arguments)
         except OSError as error:
             silence(self._stream)
-            reason = reason_of(error)
-            if isinstance(error, BrokenPipeError):
-                raise ReaderGoneError(f"cannot write standard output: {reason}") from None
-            raise StdoutError(f"cannot write standard output: {reason}") from None
+            kind = ReaderGoneError if isinstance(error, BrokenPipeError) else StdoutError
+            raise kind(f"cannot write standard output: {reason_of(error)}") from None
 
 
 def reserve() -> None:

@@ -16,7 +16,7 @@ V1 = "5:memory:/job\n4:cpu,cpuacct:/job\n0::/\n"
 
 def pretend(monkeypatch: pytest.MonkeyPatch, files: dict[str, str]) -> None:
     known = {Path(name): text.strip() for name, text in files.items()}
-    monkeypatch.setattr(machine, "_text", known.get)
+    monkeypatch.setattr(machine, "_text", lambda path: known.get(path, ""))
 
 
 def test_memory_and_quota_of_this_machine_are_plausible() -> None:

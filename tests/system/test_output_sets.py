@@ -102,10 +102,12 @@ def test_nothing_is_replaced_without_leave(taken: str, tmp_path: Path) -> None:
 def test_a_name_that_is_taken_meanwhile_is_not_replaced(
     taken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def later(paths: Iterable[Path]) -> None:
+    def later(temporary: Path, target: Path, overwrite: bool) -> None:
         put(tmp_path, {taken: b"another's"})
+        monkeypatch.undo()
+        output.rename(temporary, target, overwrite)
 
-    monkeypatch.setattr(output, "_refuse_existing", later)
+    monkeypatch.setattr(output, "rename", later)
     with pytest.raises(OutputError, match=f"^{tmp_path / taken} exists, add --overwrite"):
         write(tmp_path, files(NEW), overwrite=False)
     assert held(tmp_path) == {taken: b"another's"}

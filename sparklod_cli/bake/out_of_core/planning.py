@@ -19,7 +19,7 @@ from ...codecs.reader import Reader
 from ...io.reading import Source, absolute_source, open_reader
 from ...system.addresses import Place, absolute
 from ...system.errors import FormatError, InvalidSplatsError, OutOfMemoryError, ScratchError, UnreadableError, reason_of
-from ...system.output import HAS_LOCKS, created, try_lock
+from ...system.output import HAS_LOCKS, created, lock
 from ...system.progress import Progress
 from ...system.stdio import name_of
 from ...system.threads import ordered_map
@@ -301,7 +301,7 @@ def _opened_lock(path: Path) -> int:
     while True:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
-        is_free = try_lock(descriptor)
+        is_free = lock(descriptor, wait=False)
         with contextlib.suppress(FileNotFoundError):  # the run that had it was done, and removed it
             if os.path.samestat(os.fstat(descriptor), path.stat()):
                 if is_free:
