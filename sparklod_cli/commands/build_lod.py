@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,7 +44,6 @@ from .paths import NAMELESS, Folder, claim_stdout, is_same_place, keep_apart, re
 
 if TYPE_CHECKING:
     from ..api.bake_jobs import Outcome, Pair
-    from ..bake.parts_output import WrittenDetail
     from ..bake.settings import Baked, Source
     from ..bake.simplifying import Extracted, WrittenSet
     from ..codecs.encoder import Clamp
@@ -125,7 +124,38 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
             pairs: Sequence[Pair] = [(merged_source(options.inputs, instances), options.output)]
         else:
             pairs = [(source, options.target(source)) for source in options.inputs]
-        outcomes = stack.enter_context(contextlib.closing(_outcomes(ctx, options, pairs, console)))
+        how: dict[str, Any] = {
+            "overwrite": options.overwrite,
+            "threads": general.threads,
+            "progress": console.progress,
+        }
+        if options.unlod:
+            from ..api.bake_jobs import extract_files
+
+            console.announce_compiling()
+            form = options.output_form
+            written = write_options(options.written, options.cluster_sh, chunked=form.chunked)
+            outcomes = extract_files(pairs, written, form.suffix, **how)
+        else:
+            from ..api.bake_jobs import bake_files
+
+            settings = options.bake_settings(ctx)
+            console.announce_compiling(settings)
+            outcomes = bake_files(
+                pairs,
+                settings,
+                **how,
+                job=console.job,
+                say=console.say,
+                skip=options.skip_existing,
+                memory=options.memory,
+                scratch_dir=options.scratch_dir,
+                resume=options.resume,
+                scheduler=options.scheduler,
+                workers=options.workers,
+                cluster_threads=general.threads if options.scheduler is None or is_set(ctx, "threads") else None,
+            )
+        stack.enter_context(contextlib.closing(outcomes))
         for (source, target), outcome in zip(pairs, outcomes, strict=True):
             if isinstance(outcome, SparklodError):
                 failed = True
@@ -270,42 +300,6 @@ def _check_cuts(ctx: click.Context, options: BuildLodOptions) -> None:
         refuse(ctx, ("environment_beyond",), "cannot be used with --environment")
 
 
-def _outcomes(
-    ctx: click.Context, options: BuildLodOptions, pairs: Sequence[Pair], console: Console
-) -> Generator[Outcome, None, None]:
-    """Yield the result of each input, in order; loads numpy."""
-    how: dict[str, Any] = {
-        "overwrite": options.overwrite,
-        "threads": options.general.threads,
-        "progress": console.progress,
-    }
-    if options.unlod:
-        from ..api.bake_jobs import extract_files
-
-        console.announce_compiling()
-        form = options.output_form
-        written = write_options(options.written, options.cluster_sh, chunked=form.chunked)
-        return extract_files(pairs, written, form.suffix, **how)
-    from ..api.bake_jobs import bake_files
-
-    settings = options.bake_settings(ctx)
-    console.announce_compiling(settings)
-    return bake_files(
-        pairs,
-        settings,
-        **how,
-        job=console.job,
-        say=console.say,
-        skip=options.skip_existing,
-        memory=options.memory,
-        scratch_dir=options.scratch_dir,
-        resume=options.resume,
-        scheduler=options.scheduler,
-        workers=options.workers,
-        cluster_threads=options.general.threads if options.scheduler is None or is_set(ctx, "threads") else None,
-    )
-
-
 def record_of(source: Source, target: Place, outcome: Outcome) -> dict[str, Any]:
     """Return the JSON of a result; several inputs that are one scene are "inputs"."""
     if isinstance(source, (Path, Address)):
@@ -357,14 +351,31 @@ LEAST_SHARE = 0.001
 
 def report_baked(console: Console, source: Place, target: str, baked: Baked) -> None:
     """Print a line about the file, and one for each thing that a person should know."""
+    detail, tiles = baked.detail, baked.tiles
+    if tiles is not None:
+        place = ", on the Earth" if tiles.georeferenced else ""
+        contents = f"{count_of(tiles.tiles, 'tile')} of {count_of(tiles.levels, 'level')}{place}"
+    elif detail is not None:
+        environment = f", environment of {count_of(detail.environment, 'splat')}" if detail.environment else ""
+        contents = (
+            f"{count_of(len(detail.levels), 'detail level')} of {count_of(detail.regions, 'region')},"
+            f" {count_of(detail.chunks, 'chunk file')}{environment}"
+        )
+    else:
+        chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
+        contents = f"{count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks}"
     console.say(
         f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {target} "
-        f" {_contents(baked)}, {format_size(baked.bytes)}, {sum(baked.seconds.values()):.1f} s"
+        f" {contents}, {format_size(baked.bytes)}, {sum(baked.seconds.values()):.1f} s"
     )
-    if baked.detail is not None and len(baked.detail.levels) > 1:
-        console.say(f"  {_levels(baked.detail)}")
-    if baked.tiles is not None and baked.tiles.levels > 1:
-        console.say(f"  splats level by level: {', '.join(f'{count:,}' for count in baked.tiles.splats)}")
+    if detail is not None and len(detail.levels) > 1:
+        levels = (
+            f"{level.splats:,} splats ({percent_of(level.share)}, error at most {level.worst_error:.2g})"
+            for level in detail.levels[1:]
+        )
+        console.say(f"  levels below full detail: {', '.join(levels)}")
+    if tiles is not None and tiles.levels > 1:
+        console.say(f"  splats level by level: {', '.join(f'{count:,}' for count in tiles.splats)}")
     _report_tree(console, baked, baked.refine)
     if baked.clamps and (consequences := _consequences(baked)):
         console.say(f"  {consequences}")
@@ -391,21 +402,6 @@ def _report_tree(console: Console, baked: Baked, refine: Refined | None) -> None
         console.say(f"  {note}")
 
 
-def _contents(baked: Baked) -> str:
-    detail, tiles = baked.detail, baked.tiles
-    if tiles is not None:
-        place = ", on the Earth" if tiles.georeferenced else ""
-        return f"{count_of(tiles.tiles, 'tile')} of {count_of(tiles.levels, 'level')}{place}"
-    if detail is None:
-        chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
-        return f"{count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks}"
-    environment = f", environment of {count_of(detail.environment, 'splat')}" if detail.environment else ""
-    return (
-        f"{count_of(len(detail.levels), 'detail level')} of {count_of(detail.regions, 'region')},"
-        f" {count_of(detail.chunks, 'chunk file')}{environment}"
-    )
-
-
 def _refined(refined: Refined) -> str:
     gains = [
         f"{percent_of(share)} {before:.2f} -> {refined.psnr_after[share]:.2f}"
@@ -417,14 +413,6 @@ def _refined(refined: Refined) -> str:
         f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
         f" {percent_of(refined.kept)} of the splats fitted have new values"
     )
-
-
-def _levels(detail: WrittenDetail) -> str:
-    levels = (
-        f"{level.splats:,} splats ({percent_of(level.share)}, error at most {level.worst_error:.2g})"
-        for level in detail.levels[1:]
-    )
-    return f"levels below full detail: {', '.join(levels)}"
 
 
 def _written(baked: Baked) -> str:

@@ -335,7 +335,7 @@ def _parameters(group: type[Any], heading: str) -> Iterator[click.Parameter]:
             if isinstance(kind, Quantity):
                 kind = Text()
             elif isinstance(kind, tuple):
-                kind = click.Choice(kind) if all(isinstance(each, str) for each in kind) else Choice(kind)
+                kind = (click.Choice if isinstance(kind[0], str) else Choice)(list(map(str, kind)))
             elif isinstance(kind, Range):
                 least, most = (kind.least, kind.above), (kind.most, kind.below)
                 low, high = (next((end for end in ends if end is not None), None) for ends in (least, most))
@@ -435,13 +435,10 @@ class Real(_Number, click.FloatRange):
 class Choice(click.Choice):
     """One of the values of a `Setting` that are no texts."""
 
-    def __init__(self, values: Sequence[Any]) -> None:
-        super().__init__([str(each) for each in values])
-        self.values = values
-
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         text = super().convert(str(value), param, ctx)
-        return next(each for each in self.values if str(each) == text)
+        assert isinstance(param, Option)
+        return next(each for each in param.declared.kind if str(each) == text)
 
 
 class Text(click.ParamType):

@@ -14,7 +14,7 @@ import click
 
 from ..codecs.formats import ROUND_TRIPS
 from ..images.output import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
-from ..lod.budget import Budget, parse_budgets
+from ..lod.budget import Budget, doubt, parse_budgets
 from ..model import MAX_SH_DEGREE
 from ..render.settings import OF_PIXELS, SORTINGS, RenderSettings, uses_card
 from ..system.setting_fields import Quantity, Range, setting, whole
@@ -30,7 +30,6 @@ from .options.common import (
     PNG,
     General,
     assert_errors,
-    question_budgets,
     report_outcomes,
     table_output,
 )
@@ -384,13 +383,21 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
     look, general = options.appearance, options.general
     budget = None if options.cut.full else options.cut.one_budget()
     instances = options.inputs.instances()
-    # What is wrong with the output is said before much is read.
-    _output(ctx, options, options.cameras.least_count()).check([], overwrite=True)
+    # What is wrong with the output is said before much is read: least is the number of cameras known until then.
+    cameras = options.cameras
+    if cameras.views:
+        least = len(cameras.views)
+    elif cameras.dolly or cameras.keyframes:
+        least = 2 if cameras.every == 1 else 1
+    else:
+        least = -(-(cameras.orbit or 1) // cameras.every)
+    _output(ctx, options, least).check([], overwrite=True)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.jobs import draw_files, scenes_of_files
         from ..model.instances import instances_of
 
-        question_budgets(console, budget)
+        if budget is not None and (question := doubt(budget.count)):
+            console.say(question)
         console.announce_compiling("pictures")
         lod, render = options.cut.settings(), look.settings(console.say)
         reads: dict[str, Any] = {
@@ -538,7 +545,8 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
     instances = options.inputs.instances()
     keep_apart(ctx, files_read(options.cameras, instances))
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        question_budgets(console, *budgets)
+        for question in filter(None, (doubt(budget.count) for budget in budgets)):
+            console.say(question)
         console.announce_compiling("pictures")
         start = time.perf_counter()
 

@@ -13,7 +13,7 @@ from ..codecs.formats import WRITABLE, ending_of
 from ..codecs.options import WriteOptions
 from ..fitting import STEPS
 from ..fitting.settings import FitSettings
-from ..lod.budget import Budget, parse_budget
+from ..lod.budget import Budget, doubt, parse_budget
 from ..lod.builders import DETAIL_GROWTH
 from ..system import interrupts
 from ..system.addresses import Place
@@ -48,7 +48,7 @@ from .options.baking import (
     refuse_others,
     write_options,
 )
-from .options.common import EACH_AS_JSON, JSON, OVERWRITE, General, question_budgets
+from .options.common import EACH_AS_JSON, JSON, OVERWRITE, General
 from .paths import (
     NAMELESS,
     Folder,
@@ -190,7 +190,8 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
         from ..api.bake_jobs import Baked, bake_files, merged_source
 
         settings = options.settings(ctx)
-        question_budgets(console, options.to)
+        if options.to is not None and (question := doubt(options.to.count)):
+            console.say(question)
         console.announce_compiling(settings)
         source = inputs[0] if len(inputs) == 1 else merged_source(inputs)
         (baked,) = bake_files(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
+from ..lod.budget import doubt
 from ..system.progress import silent
 from ..system.setting_fields import setting
 from ..system.units import format_size, percent_of
@@ -27,7 +28,6 @@ from .options.common import (
     PNG,
     General,
     assert_errors,
-    question_budgets,
     report_outcomes,
     table_output,
 )
@@ -158,7 +158,8 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.jobs import scenes_of_files, traverse_files
 
-        question_budgets(console, budget)
+        if question := doubt(budget.count):
+            console.say(question)
         console.announce_compiling("cuts")
         screen = outputs.table.path is None and outputs.table.form is not None and is_terminal(sys.stdout)
         outputs.check()

@@ -19,7 +19,6 @@ from ..console import Console, is_terminal
 from ..paths import NamedPath, require_suffix
 
 if TYPE_CHECKING:
-    from ...lod.budget import Budget
     from ...tables.assertions import Outcome
     from ...tables.columns import Column, TableOutput
 
@@ -124,12 +123,3 @@ def assert_errors() -> Iterator[None]:
         yield
     except BadAssertionError as error:
         raise click.UsageError(f"--assert {error}") from None
-
-
-def question_budgets(console: Console, *budgets: Budget | None) -> None:
-    """Print a question about each count of splats that is too small to be meant."""
-    from ...lod.budget import doubt
-
-    for budget in budgets:
-        if budget is not None and (question := doubt(budget.count)):
-            console.say(question)

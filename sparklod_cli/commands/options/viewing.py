@@ -148,35 +148,23 @@ class Cameras:
     #: Without a source there is one camera that sees the whole scene, in place of an orbit.
     still: ClassVar[bool] = False
 
-    @property
-    def source(self) -> str:
-        """The source of cameras: one of `SOURCES`, or `AROUND` for one camera that sees the whole scene."""
-        default = AROUND if self.still else "orbit"
-        return next((name for name in SOURCES if getattr(self, name)), default)
-
     def check(self, ctx: click.Context) -> None:
-        sources = [flag_of(ctx, name) for name in SOURCES if getattr(self, name)]
+        sources = [name for name in SOURCES if getattr(self, name)]
         if len(sources) > 1:
-            raise click.UsageError(f"{' and '.join(sources)} cannot be used together; give one source of cameras")
+            flags = " and ".join(flag_of(ctx, name) for name in sources)
+            raise click.UsageError(f"{flags} cannot be used together; give one source of cameras")
+        source = sources[0] if sources else AROUND if self.still else "orbit"
         for name, known in ONLY_WITH.items():
-            if is_set(ctx, name) and self.source not in known:
+            if is_set(ctx, name) and source not in known:
                 named = [flag_of(ctx, each) for each in known if each in ctx.params]
                 refuse(ctx, [name], f"can only be used with {' or '.join(named)}")
-        if self.source not in PATHS:
+        if source not in PATHS:
             still = "cannot be used with a camera that does not move; give a path, such as --orbit"
             refuse(ctx, ("fps", "every", "seconds"), still)
-        if self.source == "orbit" and self.seconds is not None:
+        if source == "orbit" and self.seconds is not None:
             refuse(ctx, ["fps"], "cannot be used with --seconds of an orbit, which decides it")
         if self.up is not None and not any(self.up):
             raise click.UsageError("--up 0,0,0 is no direction; give another one")
-
-    def least_count(self) -> int:
-        """Return the least number of cameras known before a file is read."""
-        if self.views:
-            return len(self.views)
-        if self.dolly or self.keyframes:
-            return 2 if self.every == 1 else 1
-        return -(-(self.orbit or 1) // self.every)
 
     def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
         """Return the cameras; scenes are read only where cameras are chosen for them, or need their up axis.
@@ -218,7 +206,8 @@ class Cameras:
                 settings = replace(settings, fps=count / self.seconds)
             return sources.orbit(count, self.center, self.distance, elevation, settings, lambda: scenes().balls())
         except TooManyCamerasError as error:
-            raise click.UsageError(f"--{self.source.replace('_', '-')}: {error}") from None
+            source = next((name for name in SOURCES if getattr(self, name)), "orbit")
+            raise click.UsageError(f"--{source.replace('_', '-')}: {error}") from None
 
 
 def _world(value: str) -> Matrix:
@@ -427,8 +416,8 @@ def with_planes(
     ctx: click.Context, cameras: Cameras, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]
 ) -> RenderSettings:
     """Return settings whose near and far planes enclose the scenes, where the distance is chosen for them, too."""
-    fits_scene = cameras.distance is None and cameras.source in ONLY_WITH["distance"]
-    if not fits_scene or any(is_set(ctx, name) for name in PLANES):
+    fixed = cameras.distance is not None or any(getattr(cameras, name) for name in ONLY_WITH["world_transform"])
+    if fixed or any(is_set(ctx, name) for name in PLANES):
         return render
     from ...cameras.framing import reach
 
