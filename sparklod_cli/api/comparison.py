@@ -320,20 +320,6 @@ def compare(
     return ComparisonTable(rows, COLUMNS, [budget.text for budget in given])
 
 
-@dataclass(frozen=True)
-class Compared:
-    """Result of a comparison.
-
-    Attributes:
-        leaves: splats of full detail, all instances together.
-    """
-
-    pictures: int
-    leaves: int
-    summary: list[BudgetSummary]
-    outcomes: list[Outcome]
-
-
 def check_chart(plot: Path, *, overwrite: bool) -> None:
     """Raise a `SparklodError` where a chart cannot be written or drawn."""
     from ..figures.charts import load_matplotlib
@@ -356,13 +342,16 @@ def compare_files(
     passed: Filter | None = None,
     threads: int = 1,
     progress: Progress = silent,
-) -> Compared:
+) -> tuple[int, list[BudgetSummary], list[Outcome]]:
     """Measure how far cuts of scenes are from full detail, and write the table and the charts.
 
     Args:
         table: where the rows go, at once when all are known.
         asserts: assertions, each with the index of its budget; None for all budgets.
         passed: what the bytes of the table are passed through on their way to standard output.
+
+    Returns:
+        the splats of full detail, all instances together; the summary of each budget; the outcomes of `asserts`.
 
     Raises:
         UnfitError: there are both trees and Streamed SOG, or too many instances.
@@ -380,4 +369,4 @@ def compare_files(
         write_file(plot, [chart(series, scenes.title)], overwrite=overwrite)
     outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at], empty=EMPTY)]
     summary = summarize(rows, [budget.text for budget in budgets])
-    return Compared(len(rows), comparison.leaves, summary, outcomes)
+    return comparison.leaves, summary, outcomes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..model.splats import COLUMNS
 from ..system.progress import Progress, silent
@@ -27,39 +27,14 @@ if TYPE_CHECKING:
     from ..viewers.viewer_settings import LodSettings, StreamingSettings
 
 
-def scenes_of_files(
-    instances: Sequence[Instance],
-    *,
-    precision: str,
-    threads: int,
-    progress: Progress = silent,
-    trees_only: bool = False,
-    through: str | None = None,
-    plain: bool = True,
-    paged: bool = False,
-) -> Callable[[], Scenes]:
+def scenes_of_files(instances: Sequence[Instance], *, plain: bool = True, **how: Any) -> Callable[[], Scenes]:
     """Return a function that reads the scenes of instances when it is first called.
 
     Args:
-        precision: one of `PRECISIONS`, of the nodes that cuts are found with.
-        trees_only: refuse files without a tree or detail levels.
-        through: one of `formats.ROUND_TRIPS`, after which splats are drawn.
         plain: read all columns of splats.
-        paged: read splats as cuts need them.
+        how: further arguments of `read_scenes`.
     """
-    return functools.cache(
-        functools.partial(
-            read_scenes,
-            instances,
-            columns=COLUMNS if plain else TRAVERSED,
-            trees_only=trees_only,
-            through=through,
-            precision=precision,
-            paged=paged,
-            threads=threads,
-            progress=progress,
-        )
-    )
+    return functools.cache(functools.partial(read_scenes, instances, columns=COLUMNS if plain else TRAVERSED, **how))
 
 
 def draw_files(

@@ -323,16 +323,12 @@ CLAMPED_BY_SPZ = {
 }
 _THIN, _WIDE = "mostly how thick flat splats are; --rad-scales ln_f16 keeps them", "--rad-scales ln_f16 keeps them"
 _FAR, _COLORS = "--rad-center f32_lebytes keeps them", "the loss is hardly visible; --rad-rgb {wide} keeps them"
-#: What can be seen of clamped values, by the same.
+#: The visible effect of clamping values below the lower end, and above the upper one.
 CONSEQUENCES = {
-    ("center", False): "splats are farther away",
-    ("center", True): "splats are farther away",
-    ("scale", False): "splats are smaller",
-    ("scale", True): "splats are larger",
-    ("rgb", False): "colours are darker",
-    ("rgb", True): "colours are brighter",
-    ("sh", False): "reflections are stronger",
-    ("sh", True): "reflections are stronger",
+    "center": ("splats are farther away", "splats are farther away"),
+    "scale": ("splats are smaller", "splats are larger"),
+    "rgb": ("colours are darker", "colours are brighter"),
+    "sh": ("reflections are stronger", "reflections are stronger"),
 }
 #: "{wide}" is the encoding that holds the values.
 CLAMPED_BY_RAD = {
@@ -436,7 +432,7 @@ def _consequences(baked: Baked) -> str:
     shares: dict[str, float] = {}
     for clamp in baked.clamps:
         if clamp_matters(clamp.column, above=clamp.above, visible=clamp.visible, leaves=baked.splats):
-            text = CONSEQUENCES[clamp.column, clamp.above]
+            text = CONSEQUENCES[clamp.column][clamp.above]
             shares[text] = max(shares.get(text, 0.0), clamp.visible / baked.splats)
     if not shares:
         return ""

@@ -19,7 +19,7 @@ from ..model import MAX_SH_DEGREE
 from ..render.settings import OF_PIXELS, SORTINGS, RenderSettings, uses_card
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import format_size, parse_time
-from ..viewers.viewer_settings import BLEND, LodSettings, StreamingSettings
+from ..viewers.viewer_settings import BLEND, StreamingSettings
 from .command import COLOR, COMMON, VIEW, Command, check_declared, flag, is_set, refuse, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
 from .options.common import (
@@ -51,7 +51,7 @@ from .options.viewing import (
 from .paths import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
 
 if TYPE_CHECKING:
-    from ..api.comparison import BudgetSummary, Compared
+    from ..api.comparison import BudgetSummary
     from ..cameras.camera import Camera
     from ..cameras.sources import CameraPath
     from ..images.output import PictureOutput
@@ -568,11 +568,14 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
         path = options.cameras.path(scenes)
         check_view(ctx, console, options.cameras, path, scenes())
         render = with_planes(ctx, options.cameras, render, path, scenes)
-        compared = compare_files(
+        lod = options.cut.settings()
+        if lod.pixel_scale_limit is None and lod.render_scale == 1:  # the budget alone limits cuts
+            lod = dataclasses.replace(lod, pixel_scale_limit=0.0)
+        leaves, summary, outcomes = compare_files(
             scenes(),
             path,
             budgets,
-            _limited(options),
+            lod,
             render,
             table,
             asserts=asserts,
@@ -583,52 +586,23 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
             progress=console.progress,
         )
         console.clear()
-        console.detail(f"  {compared.pictures:,} pictures, {time.perf_counter() - start:.2f} s")
-        on_stdout, about = table.form is None and not options.as_json, [at for at, _ in asserts]
-        return _report_compared(console, path, compared, about, as_json=options.as_json, on_stdout=on_stdout)
-
-
-def _limited(options: RenderOptions) -> LodSettings:
-    """Return settings of cuts that only the budget limits, not the size of a pixel, unless a limit was given."""
-    settings = options.cut.settings()
-    if settings.pixel_scale_limit is None and settings.render_scale == 1:
-        return dataclasses.replace(settings, pixel_scale_limit=0.0)
-    return settings
-
-
-def _report_compared(
-    console: Console,
-    path: CameraPath,
-    compared: Compared,
-    about: Sequence[int | None],
-    *,
-    as_json: bool,
-    on_stdout: bool,
-) -> int:
-    """Print the results of a comparison; return the exit status.
-
-    Args:
-        about: for each assertion the index of its budget; None for all budgets.
-        on_stdout: print the summary on standard output, instead of the table.
-    """
-    summary, outcomes = compared.summary, compared.outcomes
-    if as_json:
-        asserts = [each.as_dict() for each in outcomes]
-        figures = [each.as_dict() for each in summary]
-        frames = len(path.cameras)
-        whole = {"frames": frames, "leaves": compared.leaves, "budgets": figures, "asserts": asserts}
-        print_json(whole)
-    texts = _lines(summary, path, compared.leaves)
-    if on_stdout:
-        click.echo("\n".join(texts))
-    else:
-        for line in texts:
-            console.say(line)
-    places = [
-        f", at a budget of {each.worst['budget']:,}" if at is None and each.worst is not None else ""
-        for at, each in zip(about, outcomes, strict=True)
-    ]
-    return report_outcomes(console, outcomes, places)
+        pictures = len(path.cameras) * len(budgets)
+        console.detail(f"  {pictures:,} pictures, {time.perf_counter() - start:.2f} s")
+        if options.as_json:
+            figures = [each.as_dict() for each in summary]
+            checked = [each.as_dict() for each in outcomes]
+            print_json({"frames": len(path.cameras), "leaves": leaves, "budgets": figures, "asserts": checked})
+        texts = _lines(summary, path, leaves)
+        if table.form is None and not options.as_json:
+            click.echo("\n".join(texts))
+        else:
+            for line in texts:
+                console.say(line)
+        places = [
+            f", at a budget of {each.worst['budget']:,}" if at is None and each.worst is not None else ""
+            for (at, _), each in zip(asserts, outcomes, strict=True)
+        ]
+        return report_outcomes(console, outcomes, places)
 
 
 def _lines(summary: Sequence[BudgetSummary], path: CameraPath, leaves: int) -> Iterator[str]:
@@ -640,13 +614,12 @@ def _lines(summary: Sequence[BudgetSummary], path: CameraPath, leaves: int) -> I
     head = f" {'popping':>7} {'most':>5}" if pops else ""
     yield f"  {'budget':>8} {'splats':>10} {'PSNR':>6} {'least':>6} {'SSIM':>6} {'edges':>6}{head}  worst tile"
     for each in summary:
-        popped = f" {_or_dash(each.popping):>7} {_or_dash(each.popping_max):>5}" if pops else ""
+        edges, popping, most = (
+            "-" if value is None else f"{value:.2f}" for value in (each.edge_psnr, each.popping, each.popping_max)
+        )
+        popped = f" {popping:>7} {most:>5}" if pops else ""
         yield (
             f"  {each.text:>8} {round(each.selected):>10,} {each.psnr:>6.2f} {each.psnr_min:>6.2f} {each.ssim:>6.4f}"
-            f" {_or_dash(each.edge_psnr):>6}{popped}  {each.worst_tile_psnr:.2f}"
+            f" {edges:>6}{popped}  {each.worst_tile_psnr:.2f}"
             f" at {each.worst_tile_x}, {each.worst_tile_y} of frame {each.worst_frame:,}"
         )
-
-
-def _or_dash(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
