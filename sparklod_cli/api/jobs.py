@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from ..lod.budget import Budget
     from ..model.instances import Instance
     from ..render.settings import RenderSettings
-    from ..simulation.frames import WrittenFrames
     from ..simulation.results import FrameOutputs, Summary
     from ..tables.assertions import Assertion, Outcome
     from ..tables.columns import Filter, Row
@@ -95,14 +94,14 @@ def traverse_files(
     passed: Filter | None = None,
     threads: int = 1,
     progress: Progress = silent,
-) -> tuple[WrittenFrames, Summary, list[Outcome]]:
+) -> tuple[Summary, list[Outcome], float, str | None]:
     """Simulate what a viewer draws of scenes along a path, and write tables and charts of the frames.
 
     Args:
         by_instance: make rows of single instances, too.
 
     Returns:
-        the frames written, their summary, and the outcomes of `asserts`.
+        the summary of the frames, the outcomes of `asserts`, and what `simulation.frames.write_frames` returns besides.
 
     Raises:
         UnfitError: the budget, or the chunk cache, is too small for the roots.
@@ -120,7 +119,7 @@ def traverse_files(
         from ..simulation.loading import Loader
 
         loading = Loader(scenes, settings, streaming).load(cameras.cameras[0])
-    frames = write_frames(
+    rows, in_front, note = write_frames(
         simulation, cameras, outputs, by_instance=by_instance, threads=threads, progress=progress, passed=passed
     )
     outcomes: list[Outcome] = []
@@ -128,6 +127,6 @@ def traverse_files(
         from ..tables.assertions import check
 
         nothing: Row = dict.fromkeys(column.name for column in LOADING)
-        asserted = [row | (loading or nothing if not at else nothing) for at, row in enumerate(frames.rows)]
+        asserted = [row | (loading or nothing if not at else nothing) for at, row in enumerate(rows)]
         outcomes = check(asserts, asserted, empty=EMPTY)
-    return frames, summarize(frames.rows, loading), outcomes
+    return summarize(rows, loading), outcomes, in_front, note

@@ -6,8 +6,8 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..cameras.camera import Settings
 from ..cameras.camera_files import read_path
-from ..cameras.frame import Settings
 from ..model.scene import common_axis
 from ..system.errors import NotSplatsError, SparklodError, memory_errors_translated
 from ..system.progress import Progress, silent

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..cameras import DEFAULT_SIZE, ELEVATION
-from ..cameras.camera import Camera
+from ..cameras.camera import MAX_FRAMES, Camera, Settings
 from ..cameras.camera_files import read_path, similarity
 from ..cameras.formats.table import FORMATS, Axes
-from ..cameras.frame import MAX_FRAMES, Settings
 from ..cameras.sources import CameraPath
 from ..cameras.sources import orbit as orbit_cameras
 from ..codecs.formats import PRECISIONS

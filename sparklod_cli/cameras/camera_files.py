@@ -12,11 +12,10 @@ import numpy as np
 from .. import io
 from ..system.errors import CameraPathError, SparklodError
 from ..system.untrusted import Origin, parse_json
-from .camera import Matrix, rigid
+from .camera import Matrix, Settings, rigid
 from .formats import own
 from .formats.parsing import CameraJson, Files, Parsed, finite
 from .formats.table import FORMATS, NAMES, PathFormat
-from .frame import Settings
 from .sources import CameraPath, cameras_of
 
 #: Bytes of a camera path's file. COLMAP's images.txt has all points that its images see.

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..system.errors import CameraPathError
-from .camera import Matrix, normalized
-from .frame import (
+from .camera import (
     DEFAULT_FOV_Y,
     DEFAULT_FPS,
     DEFAULT_SECONDS,
@@ -20,8 +19,10 @@ from .frame import (
     NUMBERED,
     Frame,
     Intrinsics,
+    Matrix,
     Numbers,
     frame_looking,
+    normalized,
 )
 
 #: Smallest step between knots as a share of the mean step, so that no step takes no time.

@@ -15,19 +15,23 @@ from numpy.typing import ArrayLike
 
 from ..system.errors import CameraPathError, TooManyCamerasError
 from . import framing
-from .camera import Camera, Matrix, normalized, rigid, to_opengl
-from .formats.table import Axes
-from .frame import (
+from .camera import (
     DEFAULT_FPS,
     MAX_FRAMES,
     MAX_GENERATED,
     NUMBERED,
+    Camera,
     Frame,
+    Matrix,
     Numbers,
     Settings,
     camera_of,
     frame_looking,
+    normalized,
+    rigid,
+    to_opengl,
 )
+from .formats.table import Axes
 
 if TYPE_CHECKING:
     from .framing import Balls

@@ -175,7 +175,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         path = options.cameras.path(scenes)
         check_view(ctx, console, options.cameras, path, scenes(), options.streaming.network)
         keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
-        written, whole, outcomes = traverse_files(
+        whole, outcomes, in_front, note = traverse_files(
             scenes(),
             path,
             budget,
@@ -192,10 +192,10 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         console.detail(f"  {len(path.cameras):,} frames of {path.format}, {time.perf_counter() - start:.2f} s")
         if outputs.table.path is not None:
             console.say(f"{outputs.table.path}  table of {count_of(len(path.cameras), 'frame')}")
-        if written.note:
-            console.say(f"{outputs.plot}: {written.note}")
-        if written.in_front < LEAST_IN_FRONT:
-            share = percent_of(written.in_front, 2)
+        if note:
+            console.say(f"{outputs.plot}: {note}")
+        if in_front < LEAST_IN_FRONT:
+            share = percent_of(in_front, 2)
             console.say(
                 f"warning: only {share} of the splats lie in front of the cameras; path and scene may"
                 " not share their axes (--camera-axes, --world-transform, --up)"

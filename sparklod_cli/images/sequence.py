@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..cameras.frame import DEFAULT_FPS
+from ..cameras.camera import DEFAULT_FPS
 from ..render.renderer import Renderer
 from ..render.settings import OF_PIXELS
 from ..system.output import write_file

@@ -208,21 +208,6 @@ def _cells(measured: CutStatistics, budget: int, selected: int, retained: int | 
     return cells | {"added": added, "removed": removed, "churn": churn}
 
 
-@dataclass(frozen=True)
-class WrittenFrames:
-    """Results of `write_frames`.
-
-    Attributes:
-        rows: the row of all instances together for each frame.
-        in_front: mean share of the drawn splats in front of the camera.
-        note: why the charts have no picture of the path; None if they have one, or if there are no charts.
-    """
-
-    rows: list[Row]
-    in_front: float
-    note: str | None
-
-
 def write_frames(
     simulation: Simulation,
     path: CameraPath,
@@ -232,10 +217,14 @@ def write_frames(
     threads: int = 1,
     progress: Progress = silent,
     passed: Filter | None = None,
-) -> WrittenFrames:
+) -> tuple[list[Row], float, str | None]:
     """Simulate a camera path and write the outputs: table and index files frame by frame, then the charts.
 
     `passed` filters the bytes of a table on standard output. `OutputError` if a file cannot be written.
+
+    Returns:
+        the row of all instances together for each frame; the mean share of the drawn splats in front of the camera; and
+        why the charts have no picture of the path, None if they have one, or if there are no charts.
     """
     together, in_front, most = list[Row](), list[float](), Extremes()
     extremes: dict[str, SimulatedFrame] = {}  # by criterion, and the first frame
@@ -257,7 +246,7 @@ def write_frames(
     if outputs.plot is not None:
         png, note = _charts(simulation, path, together, moments_of(most), extremes)
         write_file(outputs.plot, [png], overwrite=outputs.overwrite)
-    return WrittenFrames(together, float(np.mean(in_front)), note)
+    return together, float(np.mean(in_front)), note
 
 
 def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:

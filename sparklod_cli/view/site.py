@@ -22,10 +22,10 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
+from ..cameras.camera import Settings as CameraSettings
 from ..cameras.camera_files import read
 from ..cameras.formats.parsing import Files
 from ..cameras.formats.table import NAMES
-from ..cameras.frame import Settings as CameraSettings
 from ..cameras.sources import CameraPath
 from ..io import read_text
 from ..io.local_files import leads_away, open_plain

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import DEFAULT_SIZE, ELEVATION, framing
-from ..cameras.camera import Matrix
-from ..cameras.frame import DEFAULT_FOV_Y, Settings
+from ..cameras.camera import DEFAULT_FOV_Y, Matrix, Settings
 from ..cameras.framing import Balls, balls_of
 from ..cameras.sources import single_views, whole_scene
 from ..codecs.losses import MOST_PAGED_DEGREE, sample_loss

@@ -18,15 +18,9 @@ from .viewer_settings import pixel_limit
 
 @dataclass(frozen=True)
 class CutStatistics:
-    """Statistics of a cut, or of one instance's nodes in it; names are those of `simulation.results`.
+    """Statistics of a cut, or of one instance's nodes in it: columns that `simulation.results.COLUMNS` describes.
 
-    Attributes:
-        selected, leaves: numbers of nodes, and of those without children.
-        frontier: number of nodes left in the queue when it stops.
-        in_frustum, outside, behind: numbers of nodes by their centres: inside the frustum, outside, behind the camera.
-        level_min, level_mean, level_max: depth, edges from the root; None if no node is selected.
-        projected_px_p50, projected_px_p95: percentiles of the feature sizes inside the frustum, pixels; None without.
-        overdraw_estimate: mean number of nodes inside the frustum that cover a pixel.
+    Levels are None if no node is selected, projected sizes if none is inside the frustum.
     """
 
     selected: int

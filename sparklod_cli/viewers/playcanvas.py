@@ -471,15 +471,12 @@ def _desired(chains: Chains, files: DetailFiles, chosen: Levels, resident: NDArr
 def _there(files: DetailFiles, level: Levels, resident: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return a (R,) mask of regions that can be drawn at some levels: nothing is missing."""
     file = _file(files, level)
-    there: NDArray[np.bool_] = (file < 0) | resident[file]
-    return there
+    return (file < 0) | resident[file]
 
 
 def _file(files: DetailFiles, level: Levels) -> NDArray[np.int64]:
     """Return the (R,) files of regions at some levels; -1 for none."""
-    rows = np.arange(len(level))
-    file: NDArray[np.int64] = np.where(level >= 0, files.of_run[rows, level], -1)
-    return file
+    return np.where(level >= 0, files.of_run[np.arange(len(level)), level], -1)
 
 
 def _finer(chains: Chains, level: Levels) -> Levels:

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.camera import Camera, Settings
 from sparklod_cli.cameras.camera_files import read
 from sparklod_cli.cameras.formats.parsing import Files
 from sparklod_cli.cameras.formats.table import NAMES
-from sparklod_cli.cameras.frame import Settings
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.io import read_together
 from tests.conftest import FIXTURES

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.cameras import sources
-from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.frame import DEFAULT_UP, Frame, Settings, camera_of
+from sparklod_cli.cameras.camera import DEFAULT_UP, Camera, Frame, Settings, camera_of
 from sparklod_cli.cameras.framing import (
     FILLED,
     OUTSIDE,

@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras import sources
-from sparklod_cli.cameras.camera import look_at
-from sparklod_cli.cameras.frame import Frame, Intrinsics, Settings
+from sparklod_cli.cameras.camera import Frame, Intrinsics, Settings, look_at
 from sparklod_cli.cameras.keyframes import (
     Key,
     between,

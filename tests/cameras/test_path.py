@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.cameras.camera import Camera, Settings
 from sparklod_cli.cameras.camera_files import read
 from sparklod_cli.cameras.formats.table import Axes
-from sparklod_cli.cameras.frame import Settings
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.known import KNOWN, LANDMARK, check_pose, pixel, read_fixture, text_file

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from sparklod_cli.cameras import frame, keyframes, sources
+from sparklod_cli.cameras import keyframes, sources
 from sparklod_cli.cameras.framing import FILLED, Balls
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.commands.command import Command, values_of
@@ -232,7 +232,7 @@ def test_a_file_of_gigabytes_is_not_read(monkeypatch: pytest.MonkeyPatch) -> Non
 )
 def test_too_many_generated_cameras_are_refused(options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     made = []
-    whole = frame.frame_looking
+    whole = sources.frame_looking
 
     def counted(*arguments: Any) -> Any:
         made.append(1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sparklod_cli import io
-from sparklod_cli.cameras import frame
+from sparklod_cli.cameras import camera
 from sparklod_cli.codecs import compression
 from sparklod_cli.inspection import tree
 from sparklod_cli.system import untrusted
@@ -19,6 +19,6 @@ def test_the_figures_of_security_are_those_of_the_code() -> None:
         f"shorten texts to {untrusted.MOST} characters",
     ):
         assert said in text
-    assert (tree.MAX_DEPTHS, frame.MAX_FRAMES) == (1000, 1 << 20)
+    assert (tree.MAX_DEPTHS, camera.MAX_FRAMES) == (1000, 1 << 20)
     assert "a thousand levels" in text
     assert "(a million at most)" in text

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sparklod_cli.cameras.frame import Settings
+from sparklod_cli.cameras.camera import Settings
 from sparklod_cli.cameras.sources import CameraPath, single_views
 from sparklod_cli.images import sequence
 from sparklod_cli.images.output import output_for

@@ -12,8 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cameras.frame import DEFAULT_UP, Settings
+from sparklod_cli.cameras.camera import DEFAULT_UP, Camera, Settings
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.sources import cameras_of, orbit_frames
 from sparklod_cli.codecs.gpu import lod_tree

@@ -349,7 +349,7 @@ def test_only_buffers_that_a_tile_is_read_from_are_published(tmp_path: Path, pac
 
 
 def test_the_first_look_is_that_of_render() -> None:
-    from sparklod_cli.cameras.frame import Settings
+    from sparklod_cli.cameras.camera import Settings
     from sparklod_cli.cameras.sources import whole_scene
     from sparklod_cli.model.instances import instances_of
     from sparklod_cli.viewers.scenes import read_scenes

@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from typing import Any
 
 from ...system.errors import CameraPathError
-from ..frame import NO_LENS, Frame, Intrinsics, Settings
+from ..camera import NO_LENS, Frame, Intrinsics, Settings
 from .parsing import Files, Parsed, decoded, finite, posed, side, whole
 from .table import FORMATS
 
@@ -39,52 +38,31 @@ ANNOUNCED = re.compile(r"#\s*Number of (?:images|cameras):\s*(\d{1,18})\b", re.A
 NAMES = next(form.names for form in FORMATS if form.name == "colmap")
 
 
-@dataclass(frozen=True)
-class Model:
-    """A camera model.
+#: Camera models, in the order of their numbers in cameras.bin: numbers of focal lengths, 0 where a pinhole camera
+#: cannot replace the model, and of parameters after the principal point, all of the distortion.
+MODELS = {
+    "SIMPLE_PINHOLE": (1, 0),
+    "PINHOLE": (2, 0),
+    "SIMPLE_RADIAL": (1, 1),
+    "RADIAL": (1, 2),
+    "OPENCV": (2, 4),
+    "OPENCV_FISHEYE": (2, 4),
+    "FULL_OPENCV": (2, 8),
+    "FOV": (2, 1),
+    "SIMPLE_RADIAL_FISHEYE": (1, 1),
+    "RADIAL_FISHEYE": (1, 2),
+    "THIN_PRISM_FISHEYE": (2, 8),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (2, 12),
+    "SIMPLE_DIVISION": (1, 1),
+    "DIVISION": (2, 1),
+    "SIMPLE_FISHEYE": (1, 0),
+    "FISHEYE": (2, 0),
+    "EUCM": (2, 2),
+    "EQUIRECTANGULAR": (0, 0),
+}
 
-    Attributes:
-        name: in cameras.txt; cameras.bin has the index in `MODELS` instead.
-        focals: number of focal lengths, 1 or 2; 0 for a model that a pinhole camera cannot replace.
-        others: number of parameters after the principal point, all of the distortion.
-    """
-
-    name: str
-    focals: int
-    others: int
-
-    @property
-    def count(self) -> int:
-        return self.focals + 2 + self.others
-
-    @property
-    def distorts(self) -> bool:
-        return self.others > 0 or "FISHEYE" in self.name
-
-
-MODELS = (
-    Model("SIMPLE_PINHOLE", 1, 0),
-    Model("PINHOLE", 2, 0),
-    Model("SIMPLE_RADIAL", 1, 1),
-    Model("RADIAL", 1, 2),
-    Model("OPENCV", 2, 4),
-    Model("OPENCV_FISHEYE", 2, 4),
-    Model("FULL_OPENCV", 2, 8),
-    Model("FOV", 2, 1),
-    Model("SIMPLE_RADIAL_FISHEYE", 1, 1),
-    Model("RADIAL_FISHEYE", 1, 2),
-    Model("THIN_PRISM_FISHEYE", 2, 8),
-    Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 12),
-    Model("SIMPLE_DIVISION", 1, 1),
-    Model("DIVISION", 2, 1),
-    Model("SIMPLE_FISHEYE", 1, 0),
-    Model("FISHEYE", 2, 0),
-    Model("EUCM", 2, 2),
-    Model("EQUIRECTANGULAR", 0, 0),
-)
-
-#: The cameras by their numbers, each with its model and its lens.
-Cameras = dict[int, tuple[Model, Intrinsics]]
+#: The cameras by their numbers, each with the name of its model and its lens.
+Cameras = dict[int, tuple[str, Intrinsics]]
 
 
 def recognises_colmap(files: Files) -> bool:
@@ -135,7 +113,7 @@ def parse_colmap(files: Files, settings: Settings) -> Parsed:
         model, lens = cameras[camera] if cameras is not None else (None, NO_LENS)
         used.add(model)
         frames.append(Frame(posed(quat, position, f"image {image}"), lens, name=name))
-    distorting = sorted(model.name for model in used if model and model.distorts)
+    distorting = sorted(model for model in used if model and (MODELS[model][1] or "FISHEYE" in model))
     if distorting:
         notes.append(f"The lens distortion of {', '.join(distorting)} was ignored.")
     return Parsed(sorted(frames, key=lambda frame: _natural(frame.name)), tuple(notes))
@@ -200,9 +178,9 @@ def _text_cameras(data: bytes) -> Cameras:
         way = f"line {number} of cameras.txt"
         if len(words) < 4:
             raise CameraPathError(f"{way} has {len(words)} values, a camera has more")
-        model = next((model for model in MODELS if model.name == words[1]), None)
-        if model is None:
-            raise CameraPathError(f"{way} has a camera model {words[1][:30]!r}, which is unknown")
+        model = words[1]
+        if model not in MODELS:
+            raise CameraPathError(f"{way} has a camera model {model[:30]!r}, which is unknown")
         key, width, height, *numbers = (finite(word, way) for word in (words[0], *words[2:]))
         cameras[whole(key, way)] = (model, lens_of(model, width, height, numbers, way))
     _check_count(len(cameras), announced, "cameras.txt", "cameras")
@@ -241,7 +219,7 @@ def _binary_images(data: bytes) -> Iterator[Image]:
     reader.finish(count)
 
 
-def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Intrinsics]]]:
+def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[str, Intrinsics]]]:
     reader = _Reader(data, "cameras.bin")
     (count,) = reader.take(COUNT)
     reader.expect(count, CAMERA.size)
@@ -250,8 +228,9 @@ def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[Model, Intrinsics]
         way = f"camera {key}"
         if not 0 <= number < len(MODELS):
             raise CameraPathError(f"{way} is of model {number}, which is unknown")
-        model = MODELS[number]
-        numbers = [finite(value, way) for value in reader.take(struct.Struct(f"<{model.count}d"))]
+        model = list(MODELS)[number]
+        count_of_model = 2 + sum(MODELS[model])
+        numbers = [finite(value, way) for value in reader.take(struct.Struct(f"<{count_of_model}d"))]
         yield key, (model, lens_of(model, width, height, numbers, way))
     reader.finish(count)
 
@@ -290,11 +269,12 @@ class _Reader:
             raise CameraPathError(f"{self._name} has {left:,} bytes after the {count:,} items that it announces")
 
 
-def lens_of(model: Model, width: float, height: float, numbers: list[float], way: str) -> Intrinsics:
+def lens_of(model: str, width: float, height: float, numbers: list[float], way: str) -> Intrinsics:
     """Return the lens of a camera, without its distortion; `CameraPathError` if its model has none or other numbers."""
-    if not model.focals:
-        raise CameraPathError(f"{way} is {model.name}, which is not a pinhole camera")
-    if len(numbers) != model.count:
-        raise CameraPathError(f"{way} has {len(numbers)} parameters, not the {model.count} of {model.name}")
-    principal = numbers[model.focals], numbers[model.focals + 1]
-    return Intrinsics((side(width, way), side(height, way)), (numbers[0], numbers[model.focals - 1]), principal)
+    focals, others = MODELS[model]
+    if not focals:
+        raise CameraPathError(f"{way} is {model}, which is not a pinhole camera")
+    if len(numbers) != focals + 2 + others:
+        raise CameraPathError(f"{way} has {len(numbers)} parameters, not the {focals + 2 + others} of {model}")
+    principal = numbers[focals], numbers[focals + 1]
+    return Intrinsics((side(width, way), side(height, way)), (numbers[0], numbers[focals - 1]), principal)

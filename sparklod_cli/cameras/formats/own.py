@@ -5,13 +5,12 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
-from collections.abc import Collection
 
 import numpy as np
 
 from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
-from ..frame import NO_LENS, Frame, Intrinsics, Settings, frame_looking
+from ..camera import NO_LENS, Frame, Intrinsics, Settings, frame_looking
 from ..keyframes import Key, between
 from .parsing import CameraJson, Files, Parsed, finite, posed, side
 from .table import Axes
@@ -109,21 +108,16 @@ def resembles_csv(files: Files) -> bool:
     return files.path.suffix.lower() == ".csv" or len(COLUMNS.intersection(names)) > 1
 
 
-def lacking(names: Collection[str]) -> str:
-    """Return the error about missing columns."""
-    missing = min(([name for name in POSITION + way if name not in names] for way in (TARGET, QUAT)), key=len)
-    return (
-        f"its first line, which names the columns, lacks {', '.join(missing)}; a camera needs {', '.join(POSITION)},"
-        f" and {', '.join(TARGET)} or {', '.join(QUAT)}"
-    )
-
-
 def parse_csv(files: Files, settings: Settings) -> Parsed:
     """Parse a camera per row, with named columns."""
     lines = files.lines() or [""]
     names = _names(lines[0])
     if not recognises_csv(files):
-        raise CameraPathError(lacking(names))
+        missing = min(([name for name in POSITION + way if name not in names] for way in (TARGET, QUAT)), key=len)
+        raise CameraPathError(
+            f"its first line, which names the columns, lacks {', '.join(missing)}; a camera needs"
+            f" {', '.join(POSITION)}, and {', '.join(TARGET)} or {', '.join(QUAT)}"
+        )
     if len(set(names)) < len(names):
         raise CameraPathError("its first line names a column twice")
     frames = []

@@ -16,8 +16,7 @@ from typing import Any
 from ...system import untrusted
 from ...system.errors import CameraPathError
 from ...system.untrusted import LARGEST, Origin, decoded_text, quoted_value
-from ..camera import Matrix, pose, rotation_of
-from ..frame import Frame, Numbers
+from ..camera import Frame, Matrix, Numbers, pose, rotation_of
 
 #: Most pixels along a side of an image.
 MAX_SIDE = 1 << 16

@@ -14,8 +14,7 @@ import numpy as np
 
 from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
-from ..camera import Matrix
-from ..frame import Frame, Intrinsics, Numbers, Settings, frame_looking
+from ..camera import Frame, Intrinsics, Matrix, Numbers, Settings, frame_looking
 from ..keyframes import along, cardinal_tangents, hermite
 from .parsing import CameraJson, Files, Parsed
 

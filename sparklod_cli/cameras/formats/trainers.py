@@ -12,8 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...system.errors import CameraPathError
-from ..camera import pose
-from ..frame import NO_LENS, Frame, Intrinsics, Settings
+from ..camera import NO_LENS, Frame, Intrinsics, Settings, pose
 from .parsing import CameraJson, Files, Parsed, finite, posed
 
 #: The camera types of nerfstudio's paths that are read as pinhole cameras.
@@ -85,10 +84,7 @@ def _lens(item: CameraJson, root: CameraJson) -> Intrinsics:
     def number(key: str) -> float | None:
         return (item if item.has(key) else root).optional(key, CameraJson.number)
 
-    def side(key: str) -> int | None:
-        return (item if item.has(key) else root).optional(key, CameraJson.side)
-
-    width, height = side("w"), side("h")
+    width, height = ((item if item.has(key) else root).optional(key, CameraJson.side) for key in ("w", "h"))
     angle_x, angle_y = number("camera_angle_x"), number("camera_angle_y")
     fov, along = (angle_x, "x") if angle_x is not None else (angle_y, "y")
     if width is None or height is None:

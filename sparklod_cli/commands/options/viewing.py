@@ -174,7 +174,7 @@ class Cameras:
             InvalidSplatsError: there is no scene to fit.
         """
         from ...cameras import sources
-        from ...cameras.frame import DEFAULT_SECONDS, Settings
+        from ...cameras.camera import DEFAULT_SECONDS, Settings
 
         settings = Settings(
             axes=Axes(self.camera_axes) if self.camera_axes else None,

@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sparklod_cli.cameras.camera import Settings
 from sparklod_cli.cameras.camera_files import read
 from sparklod_cli.cameras.formats.parsing import Files
 from sparklod_cli.cameras.formats.table import FORMATS
-from sparklod_cli.cameras.frame import Settings
 from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.formats.test_same_cameras import CASES
 from tests.cameras.known import FOLDER, files_at, text_file

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sparklod_cli.cameras.camera import Settings
 from sparklod_cli.cameras.camera_files import read
-from sparklod_cli.cameras.frame import Settings
 from tests.cameras.known import FOLDER, KNOWN, LANDMARK, files_at, pixel
 from tests.interop import npm
 

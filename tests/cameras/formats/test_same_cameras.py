@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sparklod_cli.cameras.camera import Settings
 from sparklod_cli.cameras.camera_files import read
 from sparklod_cli.cameras.formats.parsing import Files
 from sparklod_cli.cameras.formats.table import FORMATS
-from sparklod_cli.cameras.frame import Settings
 from tests.cameras.known import (
     FOCAL,
     FOLDER,
