@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -37,11 +36,13 @@ def open_content(source: OpenFile) -> Reader:
     header = read_header(source.file)
     count, coefficients = _checked(header)
     trailing = header.check_size(source.size)
-    degree, elements = degree_of(coefficients), _elements(source.file, header)
+    degree, names = degree_of(coefficients), ("chunk", "vertex", "sh")[: 3 if coefficients else 2]
+    offsets = {name: offset_of(source.file, header, name) for name in names}
 
     def read(name: str, start: int, stop: int) -> Iterator[Rows]:
-        offset, row_type, rows = elements[name]
-        return rows_of(source.read_at, offset, row_type, start, stop, rows)
+        row_type = header.row_types[name]
+        assert row_type is not None
+        return rows_of(source.read_at, offsets[name], row_type, start, stop, header.counts[name])
 
     bounds = _bounds(read("chunk", 0, -(-count // CHUNK_SPLATS)))
 
@@ -99,18 +100,6 @@ def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatAr
     first = part.start % CHUNK_SPLATS
     low, high = np.split(np.repeat(of_chunks, CHUNK_SPLATS, axis=0)[first : first + len(unit)], 2, axis=1)
     return quantize.between(unit, low, high)
-
-
-#: Of an element: where its rows begin in the file, their type and number.
-Element = tuple[int, np.dtype[Any], int]
-
-
-def _elements(file: BinaryIO, header: PlyHeader) -> dict[str, Element]:
-    return {
-        name: (offset_of(file, header, name), row_type, header.counts[name])
-        for name in ("chunk", "vertex", "sh")
-        if (row_type := header.row_types.get(name)) is not None
-    }
 
 
 def _bounds(runs: Iterator[Rows]) -> dict[str, FloatArray | None]:

@@ -74,7 +74,7 @@ def _antialiased(parts: Sequence[Placed]) -> tuple[bool, tuple[str, ...]]:
 
 @dataclass(frozen=True, eq=False)
 class _FillMerged:
-    """`Reader.fill` of several scenes; can be pickled if their readers can. Takes the memory of a block."""
+    """`Reader.fill` of several scenes, in the memory of a block; can be pickled if their readers can."""
 
     parts: tuple[Placed, ...]
     firsts: tuple[int, ...]
@@ -139,11 +139,7 @@ class SceneFiles:
     open_content: Callable[[str, OpenFile], Reader]
 
     def open(self, name: str, pieces: Sequence[Piece] | None = None, row: int = 0) -> Chunk:
-        """Read the header of a file; errors name it.
-
-        Args:
-            pieces: to read later; None for all of it, from `row` on.
-        """
+        """Read the header of a file, which errors name; its pieces are those to read later, None for all of it."""
         with self._opened(name) as source:
             content = self.open_content(name, source)
         return Chunk(
@@ -167,12 +163,9 @@ class SceneFiles:
         progress: Progress = silent,
         first_row: int = 0,
     ) -> None:
-        """Fill rows with the pieces of files, several files at a time, on several threads; errors name the file.
+        """Fill all rows of `out`, the first of which is `first_row` of the pieces, several files at a time.
 
-        Args:
-            chunks: whose pieces together have every row of `out` once.
-            out: SH coefficients that a file does not have become 0.
-            first_row: number of the first row of `out` in the pieces.
+        SH coefficients that a file does not have become 0. Errors name the file.
         """
         together = min(threads, len(chunks))
 
@@ -193,11 +186,10 @@ class SceneFiles:
             progress("reading", done, len(out), "splat")
 
     def fill(self, chunks: Sequence[Chunk], degree: int, threads: int) -> Fill:
-        """Return the `Reader.fill` of files, one after the other; where blocks are read, one file stays in memory.
+        """Return the `Reader.fill` of files; where blocks are read, one file stays in memory.
 
         Args:
-            chunks: whose pieces have the rows in order where they are read in blocks.
-            threads: to read a file on, for a block.
+            chunks: in the order of the rows of their pieces, where these are read in blocks.
         """
         count = sum(chunk.rows for chunk in chunks)
         last: dict[int, Splats] = {}  # of the file that was read last, by its first row

@@ -105,7 +105,6 @@ class PlyHeader:
         counts: numbers of their rows.
         row_types: types of their rows; None if rows have lists, and so no fixed size.
         text: whether the data are ascii.
-        byte_order: "<" or ">" of binary data.
         size: bytes of the header.
         note: the first comment that is a JSON object; empty without one.
         mode: how trainers say that the splats are drawn, "mip" (with the opacity compensation of Mip-Splatting), "2dgs"
@@ -124,8 +123,7 @@ class PlyHeader:
     def check_size(self, size: int) -> int:
         """Check that a file of `size` bytes can hold all rows, before memory is allocated for them.
 
-        Returns:
-            Bytes after the last row; 0 if their number is unknown.
+        Returns the bytes after the last row; 0 if their number is unknown.
         """
         need = self.size
         for name, row_type in self.row_types.items():
@@ -311,11 +309,7 @@ def _columns(names: Collection[str], mode: str) -> dict[str, tuple[tuple[str, ..
 # Converters write infinite logits and logarithms for an opacity of 0 or 1 and a scale of 0.
 @np.errstate(over="ignore", invalid="ignore")
 def _unpack(target: Target, places: Mapping[str, tuple[Places, Coding]], rest_places: Places, block: Rows) -> int:
-    """Fill splats from a block, by the places and the decode of each column, and the places of SH, red first.
-
-    Returns:
-        The number of the row after the block.
-    """
+    """Fill splats from a block, by the places and the decode of each column, and the places of SH, red first."""
     part, rows = block
     splats, names = target.rows(part), rows.dtype.names or ()
     if rows.flags.c_contiguous and all(rows.dtype[name] == np.float32 for name in names):
@@ -436,20 +430,17 @@ def encode(
     """
     settled(scene, options)
     splats = scene.splats
-    row_type = np.dtype([(name, "<f4") for name in _inria_properties(splats.sh.shape[1])])
+    rest = [f"f_rest_{index}" for index in range(3 * splats.sh.shape[1])]
+    rotation = ["rot_0", "rot_1", "rot_2", "rot_3"]
+    names = [*REQUIRED[:3], "nx", "ny", "nz", *REQUIRED[3:6], *rest, *REQUIRED[6:10], *rotation]
+    row_type = np.dtype([(name, "<f4") for name in names])
     lines = ["ply", "format binary_little_endian 1.0"]
     lines += [] if scene.up is None else [f"comment {comment_of(up=scene.up)}"]
     lines += ["comment SplatRenderMode: mip"] if scene.antialiased else []
     lines += [f"element vertex {len(splats)}"]
-    lines += [f"property float {name}" for name in row_type.names or ()]
+    lines += [f"property float {name}" for name in names]
     yield "".join(f"{line}\n" for line in [*lines, "end_header"]).encode()
     yield from encode_rows(lambda part: _encode(splats, part, row_type), len(splats), threads, progress)
-
-
-def _inria_properties(coefficients: int) -> list[str]:
-    rest = [f"f_rest_{index}" for index in range(3 * coefficients)]
-    rotation = ["rot_0", "rot_1", "rot_2", "rot_3"]
-    return [*REQUIRED[:3], "nx", "ny", "nz", *REQUIRED[3:6], *rest, *REQUIRED[6:10], *rotation]
 
 
 def _encode(splats: Splats, part: slice, row_type: np.dtype[Any]) -> bytes:

@@ -168,13 +168,10 @@ class Reader:
         count: N splats, as the header promises.
         sh_degree: of the decoded splats.
         format, antialiased, notes, up, up_by, chunk_bytes: as in `Scene`.
-        fill: reads and decodes rows.
         header: as in `Scene`; reading all splats may add to it.
-        has_tree: whether the splats are the nodes of a tree.
         coding: called when all splats have been read, returns `Scene.coding`; None for float32.
         block: smallest number of splats that are read together; ranges are read in multiples of it.
         concurrent: several threads may call `fill` at a time.
-        threads: that decode rows.
     """
 
     count: int
@@ -205,12 +202,7 @@ class Reader:
         *,
         once: bool = False,
     ) -> tuple[Splats, LodTree | None]:
-        """Read a range of splats, and their nodes in a file with a tree, of which whole blocks are read.
-
-        Args:
-            columns: of `Splats` to read; the others may be 0.
-            once: as in `Target`.
-        """
+        """Read a range of splats, and their nodes in a file with a tree; other columns may be 0. `once` as `Target`."""
         splats, tree = Splats.zeros(stop - start, self.sh_degree), None
         if self.has_tree:
             tree = LodTree(np.empty(stop - start, np.uint16), np.empty(stop - start, np.uint32))
@@ -332,11 +324,7 @@ GENERATOR = "sparklod "
 
 @dataclass(frozen=True)
 class FileNote:
-    """Contents of the note in a file; `is_ours` if sparklod wrote it.
-
-    Attributes:
-        problems: sentences for `Scene.notes` on invalid values, which are ignored.
-    """
+    """Contents of the note in a file; `is_ours` if sparklod wrote it; `problems` are notes on invalid values."""
 
     antialiased: bool = False
     up: str | None = None

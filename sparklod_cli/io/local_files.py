@@ -63,13 +63,9 @@ for _name in ("O_BINARY", "O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"):
 
 
 def open_plain(path: Path) -> BinaryIO:
-    """Open a file for reading.
+    """Open a plain file for reading, by an absolute path without links, from `Path.resolve`.
 
-    Args:
-        path: absolute, without links, from `Path.resolve`.
-
-    Raises:
-        OSError: it does not exist, it is a folder, a pipe or a device, or it or a folder above it has become a link.
+    Raises `OSError` if it is missing, or a folder, a pipe or a device, or if it or a folder above has become a link.
     """
     file = os.fdopen(os.open(path, _FLAGS), "rb")
     try:
@@ -229,10 +225,7 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
     Args:
         path: of a file, or of a folder that holds one of the sets.
         sets: names of files that belong together; if `path` is in a set, the other files of it are read, too.
-        limit: most bytes of a file.
-
-    Raises:
-        UnreadableError: a file is missing or too large; names it.
+        limit: most bytes of a file; a larger or missing file raises `UnreadableError`, which names it.
     """
     try:
         if path.is_dir():

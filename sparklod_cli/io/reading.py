@@ -41,12 +41,7 @@ _LOCK = threading.Lock()
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """Several files that are one scene.
-
-    Attributes:
-        files: of any format that is read, without trees, and the transform of the splats of each; one file may be named
-            more than once.
-    """
+    """Several files without trees that are one scene, and the transform of each; a file may be named more than once."""
 
     files: tuple[tuple[Place, Transform], ...]
 

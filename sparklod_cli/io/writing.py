@@ -78,11 +78,9 @@ def parts_output(path: Place, *, overwrite: bool) -> Output:
 
 
 def scene_output(path: Place, form: Format, *, chunked: bool = False, overwrite: bool) -> Output:
-    """Return the output of a scene in a format.
+    """Return the output of a scene in a format; - is standard output.
 
-    Args:
-        path: of the file, or of the header where `chunked`, as for the name `form.unbundled`; - is standard output.
-        chunked: each chunk has a file of its own, beside the header; of RAD.
+    The path is that of the header where the scene is in several files: as `form.unbundled`, or as `chunked` RAD.
     """
     several = chunked or path.name.lower() == form.unbundled
     return Output(path, overwrite=overwrite, siblings=siblings_of(path) if several else None)
