@@ -21,12 +21,7 @@ from ..system.progress import Progress, silent
 
 
 def scene_like(value: Any) -> Scene:
-    """Return a scene, or a tree that is valid.
-
-    Raises:
-        TypeError: it is anything else.
-        TreeError: the tree is broken.
-    """
+    """Return a scene, or a tree, which is validated."""
     if not isinstance(value, Scene):
         raise TypeError(f"it takes a scene or a tree, not {_kind(value)}; {_SCENES}")
     value.check_tree()
@@ -34,12 +29,7 @@ def scene_like(value: Any) -> Scene:
 
 
 def camera_like(value: Any) -> Camera:
-    """Return one camera, all of whose numbers are finite.
-
-    Raises:
-        TypeError: it is anything else.
-        ValueError: a number is not finite; names its field.
-    """
+    """Return a camera; raise an error for anything else, and for numbers that are not finite."""
     if not isinstance(value, Camera):
         raise TypeError(f"a camera is a Camera, not {_kind(value)}; Camera.look_at makes one, read_cameras reads paths")
     for name in ("camera_to_world", "width", "height", "focal", "principal", "time"):
@@ -50,12 +40,7 @@ def camera_like(value: Any) -> Camera:
 
 
 def path_like(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
-    """Return cameras one after the other.
-
-    Raises:
-        TypeError: one is no camera.
-        ValueError: a number of one is not finite, there are none, or they are not in the order of their times.
-    """
+    """Return cameras one after the other; raise a ValueError unless they are in the order of their times."""
     if isinstance(cameras, CameraPath):
         for each in cameras.cameras:
             camera_like(each)
@@ -75,11 +60,7 @@ BudgetLike = int | float | str | np.integer[Any] | np.floating[Any]
 
 
 def budget_like(budget: BudgetLike) -> Budget:
-    """Return a budget of splats.
-
-    Raises:
-        TypeError, ValueError: it is no budget, or out of range.
-    """
+    """Return a budget of splats; raise an error for one that is out of range."""
     if isinstance(budget, str):
         return parse_budget(budget)
     if isinstance(budget, bool) or not isinstance(budget, (int, float, np.integer, np.floating)):
@@ -93,11 +74,7 @@ def budget_like(budget: BudgetLike) -> Budget:
 
 
 def file_path(path: Path | str) -> Path:
-    """Return the path of a file that will be written.
-
-    Raises:
-        OutputError: it names a folder.
-    """
+    """Return the path of a file that will be written; raise an `OutputError` for a folder."""
     if os.fspath(path).endswith(("/", os.sep)) or Path(path).is_dir():
         raise OutputError(f"{path} is a folder; name a file in it")
     return Path(path)

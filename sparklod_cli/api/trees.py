@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 from ..bake.in_memory import build_tree, select
 from ..bake.settings import BakeSettings
-from ..bake.simplifying import SimplifyGoal, refined, simplified
+from ..bake.simplifying import SimplifyGoal, leaves_of, refined, simplified
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
 from ..codecs.reader import check_valid
@@ -189,11 +189,7 @@ def refine(
 
 
 def fit_settings_of(refine: bool | int | FitSettings) -> FitSettings | None:
-    """Return the settings for an argument `refine`; None for no fitting.
-
-    Raises:
-        TypeError, ValueError: the argument is invalid.
-    """
+    """Return the settings for an argument `refine`; None for no fitting."""
     if isinstance(refine, bool):
         return FitSettings() if refine else None
     if isinstance(refine, FitSettings):
@@ -243,6 +239,4 @@ def extract_leaves(tree: Scene) -> Scene:
         FormatError: the scene has no tree.
         TreeError: the tree is broken.
     """
-    from ..bake.simplifying import leaves_of
-
     return leaves_of(scene_like(tree))

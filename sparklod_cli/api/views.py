@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -228,14 +228,10 @@ def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0
     instances = [each if isinstance(each, Instance) else Instance(each) for each in every]
     if not instances:
         raise ValueError("there are no scenes; give at least one scene or instance")
-    return read_scenes(_named(instances), precision=precision, threads=count)
-
-
-def _named(instances: Sequence[Instance]) -> list[Instance]:
-    """Return the instances, those without a name with one of their own."""
     unnamed = [each.file or Path(UNNAMED) for each in instances if not each.name]
     names = iter(names_of(unnamed, [each.name for each in instances if each.name]))
-    return [each if each.name else replace(each, name=next(names)) for each in instances]
+    named = [each if each.name else replace(each, name=next(names)) for each in instances]
+    return read_scenes(named, precision=precision, threads=count)
 
 
 def trees_of(viewed: Viewed, threads: int, precision: str) -> Scenes:
@@ -368,9 +364,13 @@ def read_cameras(
         raise CameraPathError(f"there is no format {format!r}; give auto or one of {', '.join(names)}")
     if every < 1:
         raise CameraPathError(f"every is {every}; give 1 or more")
+    world = None
+    if world_transform is not None:
+        numbers = np.asarray(world_transform, np.float64).ravel().tolist()
+        world = similarity(",".join(map(repr, numbers)))
     settings = Settings(
         axes=chosen,
-        world=None if world_transform is None else _matrix(world_transform),
+        world=world,
         size=size,
         fov_y=None if fov_y is None else math.radians(fov_y),
         fps=fps,
@@ -378,13 +378,6 @@ def read_cameras(
         up=up,
     )
     return read_path(Path(path), None if format == "auto" else format, settings)
-
-
-def _matrix(numbers: Any) -> Any:
-    import numpy as np
-
-    flat = np.asarray(numbers, np.float64).ravel()
-    return similarity(",".join(map(repr, flat.tolist())))
 
 
 def orbit(

@@ -391,24 +391,20 @@ def _report_tree(console: Console, baked: Baked, refine: Refined | None) -> None
     from ..model.selection import describe
 
     if refine is not None:
-        console.say(f"  {_refined(refine)}")
+        gains = [
+            f"{percent_of(share)} {before:.2f} -> {refine.psnr_after[share]:.2f}"
+            for share, before in refine.psnr_before.items()
+        ]
+        seen = f"held-out PSNR {', '.join(gains)} dB" if gains else "no held-out camera sees anything of it"
+        early = "" if refine.is_complete else ", interrupted"
+        console.say(
+            f"  refined in {count_of(refine.steps, 'step')}{early}: {seen};"
+            f" {percent_of(refine.kept)} of the splats fitted have new values"
+        )
     if baked.dropped:
         console.say(f"  left out: {describe(baked.dropped)}")
     for note in baked.notes:
         console.say(f"  {note}")
-
-
-def _refined(refined: Refined) -> str:
-    gains = [
-        f"{percent_of(share)} {before:.2f} -> {refined.psnr_after[share]:.2f}"
-        for share, before in refined.psnr_before.items()
-    ]
-    seen = f"held-out PSNR {', '.join(gains)} dB" if refined.psnr_before else "no held-out camera sees anything of it"
-    early = "" if refined.is_complete else ", interrupted"
-    return (
-        f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
-        f" {percent_of(refined.kept)} of the splats fitted have new values"
-    )
 
 
 def _written(baked: Baked) -> str:

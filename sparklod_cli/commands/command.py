@@ -161,11 +161,11 @@ class Command(click.Command):
         """
         params = [param for param in self.get_params(ctx) if isinstance(param, click.Option) and not param.hidden]
         if not whole:
-            params = [each for each in params if _heading(each) == COMMON or HELP.intersection(each.opts)]
+            params = [each for each in params if HELP & {*each.opts} or getattr(each, "heading", "") == COMMON]
         listed: dict[str, list[click.Parameter]] = {heading: [] for heading in self.headings}
         last: list[click.Parameter] = []
         for param in params:
-            heading = _heading(param)
+            heading = getattr(param, "heading", GENERAL)
             (last if heading == GENERAL else listed.setdefault(heading, [])).append(param)
         return {heading: params for heading, params in (*listed.items(), (GENERAL, last)) if params}
 
@@ -192,10 +192,6 @@ def _brief(text: str) -> str:
     about, _, default = text.partition("  [")
     sentence = about.split(". ")[0].rstrip(".") + "."
     return f"{sentence}  [{re.split('[];]', default)[0]}]" if default else sentence
-
-
-def _heading(param: click.Parameter) -> str:
-    return getattr(param, "heading", GENERAL)
 
 
 def _print_help_all(ctx: click.Context, param: click.Parameter, value: bool) -> None:
@@ -268,7 +264,12 @@ class Group(click.Group):
 
             meant: str | None = f"build-lod {shlex.quote(name)}"
         else:
-            meant = near_command(name, list(self.rows))
+            import difflib  # which takes a millisecond
+
+            plain = name.lower().replace("_", "-")
+            names = [*self.rows, *ALIASES]
+            near = [plain] if plain in names else difflib.get_close_matches(plain, names, n=1, cutoff=0.7)
+            meant = next((each if each in self.rows else ALIASES[each] for each in near), None)
         hint = f"did you mean {meant}?" if meant else f"the commands are {', '.join(self.rows)}"
         return f"there is no command {name!r}; {hint}"
 
@@ -276,18 +277,6 @@ class Group(click.Group):
         """Write the rows, without loading a command."""
         with formatter.section("Commands"):
             formatter.write_dl(list(self.rows.items()))
-
-
-def near_command(name: str, names: Sequence[str]) -> str | None:
-    """Return the command that a wrong name probably means, or None."""
-    import difflib  # which takes a millisecond, and is needed after a mistake only
-
-    plain = name.lower().replace("_", "-")
-    if plain in names or plain in ALIASES:
-        return plain if plain in names else ALIASES[plain]
-    for near in difflib.get_close_matches(plain, [*names, *ALIASES], n=1, cutoff=0.7):
-        return ALIASES.get(near, near)
-    return None
 
 
 @click.command("help", cls=Command)

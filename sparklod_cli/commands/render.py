@@ -52,7 +52,6 @@ from .paths import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, re
 
 if TYPE_CHECKING:
     from ..api.comparison import BudgetSummary
-    from ..cameras.camera import Camera
     from ..cameras.sources import CameraPath
     from ..images.output import PictureOutput
     from ..images.pixels import Color
@@ -245,28 +244,6 @@ class ComparisonOptions:
                 assertion = dataclasses.replace(assertions.parse(rest, COLUMNS), text=text.strip())
             parsed.append((texts.index(name) if colon else None, assertion))
         return parsed
-
-
-def check_sizes(output: PictureOutput, cameras: Sequence[Camera], supersample: int, *, bar: bool) -> None:
-    """Raise a `click.UsageError` where a picture is larger than can be drawn, or than its file can be."""
-    from ..images.pixels import scale_width
-
-    for camera in cameras:
-        width = camera.width + (scale_width(camera.width, camera.height) if bar else 0)
-        height, most = camera.height, MOST_SIDE.get(output.form)
-        if width * height * supersample**2 > MOST_PIXELS:
-            times = f" x {supersample**2} (--supersample {supersample})" if supersample > 1 else ""
-            raise click.UsageError(
-                f"{width:,} x {height:,} pixels{times} are more than {MOST_PIXELS:,}; give a smaller --size"
-            )
-        if most is not None and max(width, height) > most:
-            raise click.UsageError(
-                f"{width:,} x {height:,} pixels are more than {most:,} a side, the most of .{output.form}; write .png"
-            )
-    if output.kind in ("animation", "sheet") and len({(camera.width, camera.height) for camera in cameras}) > 1:
-        raise click.UsageError(
-            f"the cameras have pictures of several sizes, and those of one {output.kind} must be alike; give a --size"
-        )
 
 
 EXAMPLES = """\
@@ -465,7 +442,7 @@ def _place(
         SparklodError: a file cannot be written, before work goes into it.
     """
     from ..images.output import WITH_ALPHA
-    from ..images.pixels import check_animation
+    from ..images.pixels import check_animation, scale_width
     from ..images.sequence import PictureSettings, frame_rate
 
     look, output = options.appearance, _output(ctx, options, len(path.cameras))
@@ -488,7 +465,22 @@ def _place(
         threads=options.general.threads,
     )
     bar = (look.render.color_by is not None or options.comparison.diff is not None) and settings.bar
-    check_sizes(output, path.cameras, look.render.supersample, bar=bar)
+    supersample, most = look.render.supersample, MOST_SIDE.get(output.form)
+    for camera in path.cameras:
+        height, width = camera.height, camera.width + (scale_width(camera.width, camera.height) if bar else 0)
+        if width * height * supersample**2 > MOST_PIXELS:
+            times = f" x {supersample**2} (--supersample {supersample})" if supersample > 1 else ""
+            raise click.UsageError(
+                f"{width:,} x {height:,} pixels{times} are more than {MOST_PIXELS:,}; give a smaller --size"
+            )
+        if most is not None and max(width, height) > most:
+            raise click.UsageError(
+                f"{width:,} x {height:,} pixels are more than {most:,} a side, the most of .{output.form}; write .png"
+            )
+    if output.kind in ("animation", "sheet") and len({(each.width, each.height) for each in path.cameras}) > 1:
+        raise click.UsageError(
+            f"the cameras have pictures of several sizes, and those of one {output.kind} must be alike; give a --size"
+        )
     keep_apart(ctx, {**files_read(options.cameras, instances), "output": output.paths(path.numbers)})
     output.check(path.numbers, overwrite=options.overwrite)
     if output.kind == "animation":

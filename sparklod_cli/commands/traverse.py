@@ -35,7 +35,7 @@ from .options.viewing import Cameras, CutOptions, Inputs, check_view, files_read
 from .paths import NamedPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
-    from ..simulation.results import FrameOutputs, FrameStatistics, Moment, Summary
+    from ..simulation.results import FrameOutputs, Summary
     from ..tables.assertions import Assertion
     from ..tables.columns import Row
 
@@ -261,11 +261,17 @@ def lines(summary: Summary) -> Iterator[str]:
     if summary.quantities:
         yield from rows("a frame", f"{'':<18} {'min':>11} {'median':>11} {'p95':>11} {'max':>11}")
         for quantity in summary.quantities:
-            yield from rows("", _quantity(quantity))
+            name, style = QUANTITIES[quantity.name]
+            numbers = (quantity.min, quantity.p50, quantity.p95, quantity.max)
+            yield from rows("", f"{name:<18} " + " ".join(f"{_said(number, style):>11}" for number in numbers))
     if summary.moments:
         yield from rows("look at", f"{'frame':>7} {'time':>11}")
         for moment in summary.moments:
-            yield from rows("", _moment(moment))
+            text, style = MOMENTS[moment.criterion]
+            time_s = "" if moment.time_s is None else f"{moment.time_s:.3f} s"
+            name = f"  {printable(moment.name, WIDTH)}" if moment.name else ""
+            what = text.format(_said(moment.value, style))
+            yield from rows("", f"{moment.frame:>7,} {time_s:>11}  {what}{name}")
 
 
 def _loading(figures: Row) -> str:
@@ -276,19 +282,6 @@ def _loading(figures: Row) -> str:
         text = "never" if seconds is None else f"after {seconds:.2f} s"
         parts.append(f"{label} {text}" + (f" and {format_size(size)}" if isinstance(size, int) else ""))
     return ", ".join(parts)
-
-
-def _quantity(quantity: FrameStatistics) -> str:
-    name, style = QUANTITIES[quantity.name]
-    numbers = (quantity.min, quantity.p50, quantity.p95, quantity.max)
-    return f"{name:<18} " + " ".join(f"{_said(number, style):>11}" for number in numbers)
-
-
-def _moment(moment: Moment) -> str:
-    text, style = MOMENTS[moment.criterion]
-    time = "" if moment.time_s is None else f"{moment.time_s:.3f} s"
-    name = f"  {printable(moment.name, WIDTH)}" if moment.name else ""
-    return f"{moment.frame:>7,} {time:>11}  {text.format(_said(moment.value, style))}{name}"
 
 
 def _said(value: float, style: str) -> str:
