@@ -47,13 +47,15 @@ def build(tree: BuiltTree, source: Source, threads: int, progress: Progress) -> 
     splats, tally = select(scene.splats, settings, threads=threads)
     if tally.dropped or not len(splats):
         settings.selection.check(tally)
-    far = None
     if settings.environment_beyond is not None:
-        splats, far = split_environment(splats, settings.environment_beyond)
+        from ..lod.detail_levels import beyond
+
+        if (far := beyond(splats, settings.environment_beyond)).any():
+            if tree.environment is None:
+                tree.environment = transformed(splats.take(far), settings.transform, threads)
+            splats = splats.take(~far)
     if settings.transform is not None:
         splats = transformed(splats, settings.transform, threads)
-    if far is not None and tree.environment is None:
-        tree.environment = transformed(far, settings.transform, threads)
     tree.end("read")
     if tree.form is not None:
         codec = tree.form.codec()
@@ -61,7 +63,7 @@ def build(tree: BuiltTree, source: Source, threads: int, progress: Progress) -> 
         codec.settled(tree.statistics, tree.options)  # reports a tree that the output cannot hold before it is built
     baked.splats, baked.dropped, baked.method = len(splats), tally.dropped, settings.method
     leaves = [splats]
-    del scene, splats, far  # the builder frees its input as it goes, if nobody else holds it: a third of the peak
+    del scene, splats  # the builder frees its input as it goes, if nobody else holds it: a third of the peak
     with on_threads(threads):
         built = build_tree(leaves, settings, in_chunks=tree.in_chunks, progress=progress)
     tree.nodes = Scene(*built, antialiased, up=up)
@@ -157,14 +159,6 @@ def transformed(splats: Splats, settings: Transform | None, threads: int = 1) ->
     turned, beyond = transform(splats, settings, threads)
     check_transformed(beyond)
     return turned
-
-
-def split_environment(splats: Splats, distance: float) -> tuple[Splats, Splats | None]:
-    """Separate splats `beyond` a distance, which become the environment of a scene; None without any."""
-    from ..lod.detail_levels import beyond
-
-    far = beyond(splats, distance)
-    return (splats.take(~far), splats.take(far)) if far.any() else (splats, None)
 
 
 def read_environment(settings: BakeSettings, threads: int, progress: Progress) -> Splats:

@@ -325,17 +325,13 @@ def pictures(cameras: Iterator[Camera], nodes: FittedNodes) -> Iterator[FullDeta
     misses = 0
     for camera in cameras:
         full = draw(nodes.visible(nodes.leaves, camera)[1], camera, nodes.raster)
-        if shows_enough(full):
+        varies = on_background(full, 0.5).std(axis=(0, 1)).max() >= VARIED
+        if varies and full[..., 3].mean() >= COVERED:
             misses = 0
             yield FullDetailPicture(camera, np.rint(full.clip(0, 1) * 65535).astype(np.uint16))
         misses += 1
         if misses > MOST_MISSES:
             return
-
-
-def shows_enough(image: Image) -> bool:
-    """Return True if a picture shows enough to compare others with."""
-    return bool(image[..., 3].mean() >= COVERED and on_background(image, 0.5).std(axis=(0, 1)).max() >= VARIED)
 
 
 def scores_of(nodes: FittedNodes, held_out: Sequence[FullDetailPicture]) -> Scores:

@@ -476,7 +476,11 @@ def cluster(
         else:
             threads = threads or 1
             client = stack.enter_context(_connected(scheduler))
-            limit = _least_memory(client, memory)
+            # The least memory of all workers, and --memory.
+            known = client.scheduler_info()["workers"].values()
+            limits = [each["memory_limit"] // each["nthreads"] for each in known if each["memory_limit"]]
+            shares = [int(TASK_SHARE * each) for each in limits]
+            limit = min(shares if memory is None else [*shares, memory], default=None)
             say(f"the cluster's dashboard is at {client.dashboard_link}")
             if not client.scheduler.address.startswith(TLS):
                 say(
@@ -580,13 +584,6 @@ def _end(own: Any) -> None:
                 own.sync(process.kill)
     with contextlib.suppress(Exception):
         own.close(timeout=5)
-
-
-def _least_memory(client: Any, memory: int | None) -> int | None:
-    """Return the memory of a task in bytes: the least of all workers and of --memory; None for no limit."""
-    workers = client.scheduler_info()["workers"].values()
-    limits = [each["memory_limit"] // each["nthreads"] for each in workers if each["memory_limit"]]
-    return min([int(TASK_SHARE * limit) for limit in limits] + ([] if memory is None else [memory]), default=None)
 
 
 def _memory_limit(workers: int, memory: int | None) -> int:

@@ -86,7 +86,11 @@ def put_order(job: Job, *, threads: int, progress: Progress) -> None:
     """Order the nodes; a task. Results: the plan of each window; then the number of nodes and of levels."""
     links = _links(job)
     levels = 1
-    sequence = _by_key(job, links, progress)
+    sequence, done = np.empty(len(links.count), np.uint32), 0  # the families sorted by batch, then by key
+    for families in _merged(job.store, links.runs, links.begin):
+        sequence[done : done + len(families)] = families
+        done += len(families)
+        progress("ordering", done, 2 * len(sequence), "family")
     if len(sequence):
         by_place = links.families_at(links.starts(sequence))
         by_place = by_place[by_place >= 0]  # the families in the order of their parent nodes
@@ -103,16 +107,6 @@ def put_order(job: Job, *, threads: int, progress: Progress) -> None:
         _put_window(job, window, part, links, sequence, start, at)
         progress("ordering", nodes + part.stop, 2 * nodes, "node")
     job.store.put(ORDER, {"counts": np.array([nodes, levels], np.int64)})
-
-
-def _by_key(job: Job, links: _Links, progress: Progress) -> NDArray[np.uint32]:
-    """Return (F,) the families sorted by batch, then by key."""
-    sequence, done = np.empty(len(links.count), np.uint32), 0
-    for families in _merged(job.store, links.runs, links.begin):
-        sequence[done : done + len(families)] = families
-        done += len(families)
-        progress("ordering", done, 2 * len(sequence), "family")
-    return sequence
 
 
 def _links(job: Job) -> _Links:
