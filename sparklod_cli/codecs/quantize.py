@@ -353,7 +353,7 @@ def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
     return found
 
 
-def compensated(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blur: float) -> FloatArray:
+def compensated(opacity: FloatArray, scale: FloatArray, rounded: FloatArray | None, blur: float) -> FloatArray:
     """Return (N,) linear opacities with which splats of rounded scales cover as much as before.
 
     A code of a scale is off by 3 % and more, so that a splat gets up to 7 % larger or smaller, and with it what it adds
@@ -363,10 +363,10 @@ def compensated(opacity: FloatArray, scale: FloatArray, rounded: FloatArray, blu
     it is, bit for bit.
 
     Args:
-        rounded: (N, 3) scales as a file holds them.
+        rounded: (N, 3) scales as a file holds them; None for an SPZ file.
         blur: see `faces`; a step of the positions is a good one, for it is far below a small splat of the scene.
     """
-    area = faces(rounded, blur)
+    area = faces(decode_log_scale(encode_log_scale(scale)) if rounded is None else rounded, blur)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(area > 0, np.clip(faces(scale, blur) / area, LEAST_GROWTH, MOST_GROWTH), 1)
     wide = opacity.astype(np.float64)

@@ -522,7 +522,9 @@ class SpzEncoder:
         for part in blocks_of(len(splats)):
             some, links = splats.take(part), None if tree is None else tree.rows(part)
             is_leaf = None if links is None else links.is_leaf
-            some = dataclasses.replace(some, opacity=opacities(some, bits, covering=self.options.covering))
+            if self.options.covering:
+                opacity = quantize.compensated(some.opacity, some.scale, None, 2.0**-bits)
+                some = dataclasses.replace(some, opacity=opacity)
             for stream in streams:
                 if stream.name == "sh":
                     values = sh_codes(some.sh, is_leaf, sh_bits)
@@ -614,6 +616,8 @@ def encoder(
 
     With `counting`, it counts the values that it clamps.
     """
+    from .encoder import SPZ_RANGES  # not needed to read
+
     if options.spz_version is None or options.fractional_bits is None or options.sh_bits is None:
         raise ValueError("the options leave choices open; `settled` makes them")
     if isinstance(scene, Scene):
@@ -622,7 +626,7 @@ def encoder(
         count, sh_degree, has_tree = scene.count, scene.sh_degree, True
     flags = ANTIALIASED * scene.antialiased | LOD * has_tree
     layout = Layout(options.spz_version, count, sh_degree, options.fractional_bits, flags)
-    return SpzEncoder(layout, scene.up, options, tuple(held(options, sh_degree)) if counting else ())
+    return SpzEncoder(layout, scene.up, options, SPZ_RANGES if counting else ())
 
 
 def to_code(
@@ -639,15 +643,10 @@ def to_code(
     sh = splats.sh
     if sh.shape[1] and len(sh):
         sh = quantize.decode_sh(sh_codes(sh, is_leaf, sh_bits))
-    return dataclasses.replace(splats, opacity=opacities(splats, fractional_bits, covering=covering), sh=sh)
-
-
-def opacities(splats: Splats, fractional_bits: int, *, covering: bool) -> FloatArray:
-    """Return (N,) linear opacities that make up for the rounding of scales, if `covering`."""
-    if not covering:
-        return splats.opacity
-    rounded = quantize.decode_log_scale(quantize.encode_log_scale(splats.scale))
-    return quantize.compensated(splats.opacity, splats.scale, rounded, 2.0**-fractional_bits)
+    opacity = splats.opacity
+    if covering:
+        opacity = quantize.compensated(opacity, splats.scale, None, 2.0**-fractional_bits)
+    return dataclasses.replace(splats, opacity=opacity, sh=sh)
 
 
 def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) -> Bytes:

@@ -10,7 +10,7 @@ import math
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,15 +68,6 @@ SAMPLE = 1 << 20
 RUN = 1 << 8
 
 
-class CodedProperty(NamedTuple):
-    """Property of a chunk: encoding, codes of any shape that are not compressed, and ends of their range, if any."""
-
-    encoding: str
-    codes: NDArray[Any]
-    min: float | None
-    max: float | None
-
-
 @dataclass(frozen=True, eq=False)
 class Palette:
     """Spherical harmonics that splats share.
@@ -128,6 +119,8 @@ class RadEncoder:
         header: of the file, but for its chunks.
         codes: ranges of codes.
         palette: of SH; None for coefficients of each splat.
+        stored: chunks of a file whose codes are kept, see `unchanged`.
+        unchanged: (N,) nodes that get their codes of `stored`, where the encoding is the same; None for none.
     """
 
     header: RadHeader
@@ -135,6 +128,8 @@ class RadEncoder:
     options: WriteOptions
     ranges: tuple[CodeRange, ...]
     palette: Palette | None = None
+    stored: Sequence[StoredChunk] = ()
+    unchanged: NDArray[np.bool_] | None = None
 
     def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
         """Encode a chunk: its bytes, and their number."""
@@ -167,27 +162,54 @@ class RadEncoder:
         payload, properties, at = [], [], 0
         labels = None if self.palette is None else self.palette.labels_of(splats, start)
         for row in self._rows(first=start == 0):
-            made = self.coded(row, splats, tree, labels, start)
-            data = self._deflated(made.codes, made.encoding)
-            properties.append(Property(at, len(data), row.name, made.encoding, GZ, made.min, made.max))
+            encoding, codes, low, high = self._coded(row, splats, tree, labels, start)
+            data = self._deflated(codes, encoding)
+            properties.append(Property(at, len(data), row.name, encoding, GZ, low, high))
             payload += [data, bytes(padding(len(data)))]
             at += len(data) + padding(len(data))
         sh_degree, has_tree = self.header.max_sh, self.header.lod_tree
         header = RadChunkHeader(start, len(splats), at, sh_degree, has_tree, tuple(properties), self.codes)
         return b"".join([pack_chunk_header(header), *payload])
 
-    def keeping(self, stored: Sequence[StoredChunk], unchanged: NDArray[np.bool_]) -> KeepingEncoder:
+    def keeping(self, stored: Sequence[StoredChunk], unchanged: NDArray[np.bool_]) -> RadEncoder:
         """Return an encoder that gives (N,) `unchanged` nodes their codes of a file, where its encoding is the same."""
-        return KeepingEncoder(**vars(self), stored=stored, unchanged=unchanged)
+        return dataclasses.replace(self, stored=stored, unchanged=unchanged)
 
-    def coded(
+    def _coded(
         self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
-    ) -> CodedProperty:
-        """Encode a property of the chunk that begins with node `start`."""
+    ) -> tuple[str, NDArray[Any], float | None, float | None]:
+        """Encode a property of the chunk that begins with node `start`.
+
+        Returns:
+            its encoding; codes of any shape, which are not compressed; and the ends of their range, None without one.
+        """
         encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
-        low, high = code_range(row, self.codes)
-        codes = CODINGS[encoding].encode(self.values(row, encoding, splats, tree, labels), low, high)
-        return CodedProperty(encoding, codes, *((low, high) if CODINGS[encoding].ends else (None, None)))
+        coding, stop = CODINGS[encoding], start + len(splats)
+        values = self.values(row, encoding, splats, tree, labels)
+        former = None if self.unchanged is None else self._former(row.name, start, stop)
+        if self.unchanged is None or former is None or former[0].encoding != encoding:
+            low, high = code_range(row, self.codes)
+            return encoding, coding.encode(values, low, high), *((low, high) if coding.ends else (None, None))
+        each, before = former
+        flat = _flat(coding.encode(values, each.min or 0.0, each.max or 0.0), encoding, len(splats))
+        unchanged = self.unchanged[start:stop]
+        _by_splat(flat, row, encoding)[unchanged] = before[unchanged]
+        return encoding, _stored(flat, encoding, len(splats)), each.min, each.max
+
+    def _former(self, name: str, start: int, stop: int) -> tuple[Property, Bytes] | None:
+        """Return a property of some nodes and (n, ...) their codes; None where its coding differs between chunks."""
+        found, codes = [], []
+        for chunk in self.stored:
+            own = chunk.codes.get(name)
+            part = slice(max(start - chunk.start, 0), max(stop - chunk.start, 0))
+            if own is None:
+                return None
+            if len(own[part]):
+                found.append(chunk.properties[name])
+                codes.append(own[part])
+        if len({(each.encoding, each.min, each.max) for each in found}) != 1:
+            return None
+        return found[0], np.concatenate(codes)
 
     def _rows(self, *, first: bool) -> Iterator[Row]:
         for row in PROPERTIES:
@@ -359,44 +381,6 @@ def stored(source: OpenFile, options: WriteOptions) -> tuple[list[StoredChunk], 
                 codes[row.name] = np.ascontiguousarray(_by_splat(flat, row, each.encoding))
         chunks.append(StoredChunk(packed.header.base, properties, codes))
     return chunks, _like(reader.header, chunks[0].properties, options)
-
-
-@dataclass(frozen=True, eq=False)
-class KeepingEncoder(RadEncoder):
-    """Encoder that gives the (N,) `unchanged` nodes their `stored` codes."""
-
-    stored: Sequence[StoredChunk] = ()
-    unchanged: NDArray[np.bool_] = dataclasses.field(default_factory=lambda: np.zeros(0, bool))
-
-    def coded(
-        self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
-    ) -> CodedProperty:
-        """Encode a property of a chunk in its former range."""
-        made, stop = super().coded(row, splats, tree, labels, start), start + len(splats)
-        found = self._stored(row.name, start, stop)
-        if found is None or found[0].encoding != made.encoding:
-            return made
-        each, before = found
-        low, high = (0.0 if end is None else end for end in (each.min, each.max))
-        codes = CODINGS[made.encoding].encode(self.values(row, made.encoding, splats, tree, labels), low, high)
-        flat, unchanged = _flat(codes, made.encoding, len(splats)), self.unchanged[start:stop]
-        _by_splat(flat, row, made.encoding)[unchanged] = before[unchanged]
-        return CodedProperty(made.encoding, _stored(flat, made.encoding, len(splats)), each.min, each.max)
-
-    def _stored(self, name: str, start: int, stop: int) -> tuple[Property, Bytes] | None:
-        """Return a property of some nodes and (n, ...) their codes; None where its coding differs between chunks."""
-        found, codes = [], []
-        for chunk in self.stored:
-            own = chunk.codes.get(name)
-            part = slice(max(start - chunk.start, 0), max(stop - chunk.start, 0))
-            if own is None:
-                return None
-            if len(own[part]):
-                found.append(chunk.properties[name])
-                codes.append(own[part])
-        if len({(each.encoding, each.min, each.max) for each in found}) != 1:
-            return None
-        return found[0], np.concatenate(codes)
 
 
 def _flat(codes: NDArray[Any], encoding: str, count: int) -> Bytes:

@@ -34,8 +34,9 @@ from ..kernels import texels
 from ..options import DEFAULTS, MAX_SH_CODES, WriteOptions
 from ..reader import Note, OpenFile, Reader, Target, note_of, read_note
 from . import texel_codings as codings
-from .sog_container import LARGEST, MAX_SIDE, Pixels, SogFiles, Texels, encode_webp, has, image_of, size_for, zipped
+from .sog_container import LARGEST, SogFiles, has, image_of, size_for, zipped
 from .texel_codings import codebook, even_codebook, nearest
+from .webp import MAX_SIDE, Pixels, Texels, encode_webp
 
 #: Most entries of the palette of SH: a label has 16 bits.
 MAX_PALETTE = 1 << 16

@@ -12,7 +12,7 @@ from PIL import Image
 
 from fixtures import by_hand_sog
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.sog.sog_container import MOST_BEFORE, pixels_of, read_header
+from sparklod_cli.codecs.sog.webp import MOST_BEFORE, pixels_of, read_header
 from tests.conftest import FIXTURES, Capture
 
 SOG, STREAMED = FIXTURES / "golden" / "sh1-sog", FIXTURES / "golden" / "sh1-streamed-sog"

@@ -17,7 +17,7 @@ import sparklod_cli
 from sparklod_cli.codecs.options import SogOptions, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.sog import codec as sog
-from sparklod_cli.codecs.sog import sog_container
+from sparklod_cli.codecs.sog import sog_container, webp
 from sparklod_cli.io import read_scene
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
@@ -200,7 +200,7 @@ def test_images_hold_all_splats_in_about_a_square(count: int) -> None:
     width, height = sog_container.size_for(count)
     assert width * height >= count
     assert (width % 4, height % 4) == (0, 0)
-    assert height <= width <= sog_container.MAX_SIDE
+    assert height <= width <= webp.MAX_SIDE
     assert width * (height - 4) < count
 
 

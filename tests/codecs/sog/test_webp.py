@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fixtures import by_hand_sog
-from sparklod_cli.codecs.sog import sog_container
+from sparklod_cli.codecs.sog import webp
 from sparklod_cli.system.errors import FormatError
 
 Texels = NDArray[np.uint8]
@@ -27,8 +27,8 @@ def encoded(texels: Texels, quality: int = 50, method: int = 1) -> bytes:
 def decoded(data: bytes, most: int = 1 << 30) -> Texels:
     """(height, width, 4) R G B A, where a read gives at most so many bytes."""
     file = io.BytesIO(data)
-    header = sog_container.read_header(file.read, "x.webp")
-    pixels = sog_container.pixels_of(header, lambda size: file.read(min(size, most)), "x.webp")
+    header = webp.read_header(file.read, "x.webp")
+    pixels = webp.pixels_of(header, lambda size: file.read(min(size, most)), "x.webp")
     shape = header.height, header.width, 4
     return pixels.astype("<u4").view(np.uint8).reshape(shape)[..., [2, 1, 0, 3]]
 
