@@ -26,7 +26,7 @@ from sparklod_cli.cameras.framing import framing
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.model.traversed import Nodes
+from sparklod_cli.model.tree_nodes import Nodes
 from sparklod_cli.system.threads import on_threads, ordered_map, processors
 from sparklod_cli.viewers.continuous import ContinuousCuts
 from sparklod_cli.viewers.cut import Forest, TreeInstance

@@ -35,7 +35,7 @@ def build(tree: BuiltTree, source: Source, threads: int, progress: Progress) -> 
     if settings.environment is not None:
         tree.environment = read_environment(settings, threads, progress)
     antialiased, up = scene.antialiased, settings.up or scene.up
-    if settings.transform is not None:
+    if up is not None and settings.transform is not None:
         up = rotated_axis(up, settings.transform.rotation)
     if scene.tree is not None:
         keep_tree(tree, source, scene)
@@ -78,8 +78,7 @@ def put_in_order(tree: BuiltTree, threads: int, progress: Progress) -> None:
     baked.levels = int(scene.tree.depths().max()) + 1
     if tree.in_chunks and not tree.is_ordered:
         with on_threads(threads):
-            from ..lod.chunk_order import chunk_order
-            from ..lod.families import reordered
+            from ..lod.chunk_order import chunk_order, reordered
 
             order, child_start = chunk_order(scene.splats, scene.tree, progress=progress)
             built, antialiased, up = [(scene.splats, scene.tree)], scene.antialiased, scene.up
@@ -110,7 +109,7 @@ def build_tree(
     builder = import_module(f"..lod.{settings.method}", __package__)
     built = [builder.build(leaves.pop(), getattr(settings, row.setting), progress=progress)]
     if row.in_bands and not in_chunks:
-        from ..lod.families import banded
+        from ..lod.chunk_order import banded
 
         return banded(built)
     return built.pop()

@@ -43,7 +43,7 @@ def merged(parts: Sequence[Placed]) -> Reader:
     degree = max(part.reader.sh_degree for part in parts)
     antialiased, notes = _antialiased(parts)
     notes += tuple(f"{part.name}: {note}" for part in parts for note in part.reader.notes)
-    axes = [rotated_axis(part.reader.up, part.transform.rotation) for part in parts]
+    axes = [part.reader.up and rotated_axis(part.reader.up, part.transform.rotation) for part in parts]
     if len(set(axes)) > 1:
         notes += (f"{differing(axes)}, so none is noted unless --up names it",)
     return Reader(

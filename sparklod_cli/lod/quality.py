@@ -30,10 +30,19 @@ from ..system.progress import Progress, silent
 from ..system.threads import threads_for
 from .builders import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
 from .check import Bounds, check
-from .final_tree import FinalTree, PruningGoal, in_final_order
 from .kernels import pair_cost
 from .kernels.sort import Nodes
-from .pair_tree import BinaryTree, Curve, Levels, levels_of, lowest_level, merge_levels
+from .pair_tree import (
+    BinaryTree,
+    Curve,
+    FinalTree,
+    Levels,
+    PruningGoal,
+    in_final_order,
+    levels_of,
+    lowest_level,
+    merge_levels,
+)
 from .stage_records import NO_FAMILY, STAGE_BITS, Pending, Region, StageFamilies
 
 #: For each node that a stage hands on, it leaves this many times what the growth allows for a leaf to those above it:

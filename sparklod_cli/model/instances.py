@@ -14,15 +14,14 @@ from numpy.typing import NDArray
 
 from .foveation import Foveation
 from .scene import Scene
-from .traversed import DetailScene, TileScene
 
 if TYPE_CHECKING:
     from .transforms import Transform
+    from .traversed import DetailScene, TileScene
+
+    Source = Path | Scene | DetailScene | TileScene
 
 Matrix = NDArray[np.float64]
-
-#: Source of the splats of an instance.
-Source = Path | Scene | DetailScene | TileScene
 
 #: Name of all instances together in tables.
 TOTAL = "total"
@@ -54,8 +53,11 @@ class Instance:
     def __post_init__(self) -> None:
         if isinstance(self.source, str):
             object.__setattr__(self, "source", Path(self.source))
-        if not isinstance(self.source, (Path, Scene, DetailScene, TileScene)):
-            raise TypeError(f"an instance is of a file or a scene, not of {type(self.source).__name__}")
+        if not isinstance(self.source, (Path, Scene)):
+            from .traversed import DetailScene, TileScene
+
+            if not isinstance(self.source, (DetailScene, TileScene)):
+                raise TypeError(f"an instance is of a file or a scene, not of {type(self.source).__name__}")
         matrix = np.asarray(self.object_to_world, np.float64)
         if matrix.shape != (4, 4):
             raise ValueError(f"object_to_world has the shape {matrix.shape}; give (4, 4)")

@@ -198,16 +198,14 @@ def differing(axes: Iterable[str | None]) -> str:
     return f"the files differ in the axis that is up ({', '.join(dict.fromkeys(axis or 'unknown' for axis in axes))})"
 
 
-def rotated_axis(axis: str | None, rotation: ArrayLike) -> str | None:
-    """Return the axis, one of `AXES`, nearest to where a rotation takes an axis; None for None.
+def rotated_axis(axis: str, rotation: ArrayLike) -> str:
+    """Return the axis, one of `AXES`, nearest to where a rotation takes an axis.
 
     The nearest one, since a rotation by a few degrees levels a scene whose axis was only roughly up.
 
     Args:
         rotation: (3, 3) matrix that multiplies column vectors; it may scale them, too.
     """
-    if axis is None:
-        return None
     up = np.asarray(rotation, np.float64) @ AXES[axis]
     return max(AXES, key=lambda name: float(up @ AXES[name]))
 

@@ -1,18 +1,16 @@
-"""Scenes as viewers traverse them: the nodes of trees, regions at several detail levels, and hierarchies of tiles."""
+"""Scenes as viewers traverse them besides trees: regions at several detail levels, and hierarchies of tiles."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .lod_tree import CHUNK_NODES, LodTree
 from .scene import Scene, facts_of
-from .splats import FloatArray, Splats
+from .splats import Splats
 
 Bounds = NDArray[np.float64]
 Counts = NDArray[np.int64]
@@ -22,36 +20,6 @@ def _check_shapes(scene: DetailScene | TileScene, shapes: Mapping[str, tuple[int
     for name, shape in shapes.items():
         if getattr(scene, name).shape != shape:
             raise ValueError(f"{name} has the shape {getattr(scene, name).shape}; expected {shape}")
-
-
-@dataclass(frozen=True)
-class Nodes:
-    """N nodes of a tree, which is not validated, with (N, 3) float32 centres and (N,) feature sizes, world units."""
-
-    center: FloatArray
-    size: FloatArray
-    tree: LodTree
-
-    #: Whether nodes are read as cuts need them.
-    paged: ClassVar[bool] = False
-
-    @property
-    def count(self) -> int:
-        return len(self.size)
-
-    @property
-    def chunks(self) -> int:
-        return -(-self.count // CHUNK_NODES)
-
-    @property
-    def depth(self) -> NDArray[np.int32]:
-        return self.tree.depths()
-
-    def fill(self, rows: NDArray[np.void]) -> None:
-        """Fill (N,) `pixel_scale.NODE`."""
-        rows["x"], rows["y"], rows["z"] = self.center.T
-        rows["size"] = self.size
-        rows["child_start"], rows["child_count"] = self.tree.first_child(), self.tree.child_count
 
 
 @dataclass(frozen=True, eq=False)

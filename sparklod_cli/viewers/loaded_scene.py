@@ -17,7 +17,7 @@ from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, Splats
-from ..model.traversed import Nodes
+from ..model.tree_nodes import Nodes
 from .cut import Forest, TreeCut, TreeInstance, views_of
 from .spark import header_answers
 from .viewer_settings import FETCHERS

@@ -19,7 +19,7 @@ from ..model.file_coding import FileCoding
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
 from ..model.splats import COLUMNS, Splats
-from ..model.traversed import Nodes
+from ..model.tree_nodes import Nodes
 from ..system.errors import TreeError, naming
 from ..system.machine import available_memory
 from ..system.threads import ordered_map

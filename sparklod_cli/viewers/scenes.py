@@ -25,7 +25,6 @@ from ..model.instances import Instance, Matrix
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene, common_axis, facts_of, rotated_axis
 from ..model.splats import COLUMNS, Splats
-from ..model.traversed import DetailScene, TileScene
 from ..system.errors import FormatError, InvalidSplatsError, TreeError, UnfitError, memory_errors_translated, naming
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
@@ -36,6 +35,7 @@ from .spark import SparkViewer
 from .viewer_settings import PLAYCANVAS_BUDGET, LodSettings
 
 if TYPE_CHECKING:
+    from ..model.traversed import DetailScene, TileScene
     from .continuous import BlendedCut, ContinuousCuts
     from .paging import Pages
 
@@ -151,7 +151,7 @@ class Scenes:
         """For each instance the name of its file, the axis of the world that is up, and which specification says so."""
         axes = list[tuple[str, str | None, str]]()
         for instance, loaded in zip(self.instances, self.of_instance, strict=True):
-            up = rotated_axis(loaded.scene.up, instance.object_to_world[:3, :3])
+            up = loaded.scene.up and rotated_axis(loaded.scene.up, instance.object_to_world[:3, :3])
             axes.append((loaded.name, up, loaded.scene.up_by if up == loaded.scene.up else ""))
         return axes
 
@@ -381,15 +381,16 @@ def read_scenes(
             size = bytes_of(scene.splats) if file is None else size_of_input(file) or 0
             drawn = scene.splats if through is None else _after(through, file, scene, threads)
             entry: LoadedScene = LoadedScene(file, size, scene, drawn, chunks, precision, threads)
-        elif isinstance(found, (DetailScene, TileScene)):
-            entry = _loaded_runs(file, found, through, chunks, threads)
-            notes += (f"{entry.name}: {note}" for note in found.notes)
         else:
-            from .paging import PagedScene
+            from .paging import PagedScene, Pages
 
-            assert file is not None
-            empty = replace(found.file.scene, tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
-            entry = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=found)
+            if isinstance(found, Pages):
+                assert file is not None
+                empty = replace(found.file.scene, tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
+                entry = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=found)
+            else:
+                entry = _loaded_runs(file, found, through, chunks, threads)
+                notes += (f"{entry.name}: {note}" for note in found.notes)
         loaded[key] = entry
         of_instance.append(entry)
         chunks += entry.chunks
@@ -400,6 +401,8 @@ def _loaded_runs(
     file: Path | None, found: DetailScene | TileScene, through: str | None, chunks: int, threads: int
 ) -> LoadedScene:
     """Return all tiles, or all levels and the environment, as one scene with its files."""
+    from ..model.traversed import DetailScene, TileScene
+
     splats = found.splats
     if isinstance(found, DetailScene) and found.environment is not None:
         degree = min(splats.sh_degree, found.environment.sh_degree)

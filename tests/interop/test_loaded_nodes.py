@@ -22,7 +22,7 @@ from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import FloatArray
-from sparklod_cli.model.traversed import Nodes
+from sparklod_cli.model.tree_nodes import Nodes
 from sparklod_cli.viewers.cut import TreeInstance
 from sparklod_cli.viewers.loaded_scene import nodes_of
 from sparklod_cli.viewers.scenes import read_scenes

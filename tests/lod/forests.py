@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.traversed import Nodes
+from sparklod_cli.model.tree_nodes import Nodes
 from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from tests.lod.sights import CutView

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.model.traversed import Nodes
+from sparklod_cli.model.tree_nodes import Nodes
 from sparklod_cli.viewers.cut import TreeCut, TreeInstance
 from sparklod_cli.viewers.frame_statistics import Changes, CutStatistics, measure
 from sparklod_cli.viewers.spark import SparkViewer

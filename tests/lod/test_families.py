@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod import families, quality, quick
-from sparklod_cli.lod.families import banded, families_of
+from sparklod_cli.lod import chunk_order, quality, quick
+from sparklod_cli.lod.chunk_order import banded, families_of
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
@@ -18,7 +18,7 @@ from tests.scenes import random_splats
 
 @pytest.fixture(autouse=True)
 def _small_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(families, "FIRST_BAND", 16)
+    monkeypatch.setattr(chunk_order, "FIRST_BAND", 16)
 
 
 def limits(nodes: Splats, tree: LodTree) -> np.ndarray:

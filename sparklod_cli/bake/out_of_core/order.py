@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from ...codecs.encoder import windows_of
 from ...lod.builders import BUILDERS
-from ...lod.chunk_order import MOST_FAMILIES, family_order
-from ...lod.families import band_order
+from ...lod.chunk_order import MOST_FAMILIES, band_order, family_order
 from ...lod.kernels.tree_links import find_limits
 from ...lod.stage_records import NO_FAMILY, STAGE_BITS
 from ...model.lod_tree import CHUNK_NODES, LodTree
@@ -250,7 +249,7 @@ def node_stream(job: Job, count: int) -> NodeStream:
     """Return the nodes of an ordered tree."""
     read = functools.partial(_read, job.store, width_of(job.sh_degree))
     up = job.settings.up or job.stream.up
-    if job.settings.transform is not None:
+    if up is not None and job.settings.transform is not None:
         up = rotated_axis(up, job.settings.transform.rotation)
     return NodeStream(count, job.sh_degree, job.stream.antialiased, read, up)
 

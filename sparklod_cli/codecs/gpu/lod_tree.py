@@ -18,7 +18,7 @@ from ...model.file_coding import SPZ_SCALES, FileCoding, ScaleCoding
 from ...model.gaussian import size_factor, spark_size
 from ...model.lod_tree import MAX_CHILDREN, LodTree
 from ...model.splats import FloatArray, Splats
-from ...model.traversed import Nodes
+from ...model.tree_nodes import Nodes
 from ...system.errors import FormatError
 from ...system.threads import for_blocks
 from .. import quantize, spark_codings

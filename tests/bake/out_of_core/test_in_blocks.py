@@ -18,7 +18,7 @@ from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.bake.tree_output import BuiltTree
 from sparklod_cli.codecs.statistics import ALL
-from sparklod_cli.lod import families, quick
+from sparklod_cli.lod import chunk_order, quick
 from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -40,7 +40,7 @@ def _small_windows() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(order, "WINDOW_NODES", 64)
         patch.setattr(store, "GAP", 5)
-        patch.setattr(families, "FIRST_BAND", 16)
+        patch.setattr(chunk_order, "FIRST_BAND", 16)
         patch.setattr(order, "MERGED", 20)
         patch.setattr(order, "PROBES", 5)
         yield

@@ -19,7 +19,7 @@ from sparklod_cli.model.file_coding import PLAIN_SCALES, SPZ_SCALES, FileCoding,
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.model.traversed import Nodes
+from sparklod_cli.model.tree_nodes import Nodes
 from tests.scenes import random_splats
 
 SPZ = FileCoding((SPZ_SCALES,))
