@@ -20,8 +20,8 @@ from fixtures import by_hand, by_hand_ksplat, by_hand_splat
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs import ply, spz
-from sparklod_cli.codecs.formats import ENCODINGS
-from sparklod_cli.codecs.options import MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import ENCODINGS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
+from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_options
 from sparklod_cli.codecs.spark_codings import log_scale_table
 from sparklod_cli.inspection import leaves, values

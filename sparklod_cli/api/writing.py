@@ -8,8 +8,7 @@ from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING
 
-from ..codecs.formats import MANIFEST
-from ..codecs.options import DEFAULT_COMPRESSION
+from ..codecs.formats import DEFAULT_COMPRESSION, MANIFEST
 from ..io import parts_output, scene_output, write_scene
 from ..model.scene import Scene
 from ..system.errors import FormatError, InvalidSplatsError, memory_errors_translated, naming

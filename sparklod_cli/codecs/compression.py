@@ -14,7 +14,7 @@ from zlib_ng import zlib_ng
 from ..system.errors import PromiseError
 from ..system.progress import Progress
 from ..system.threads import ordered_map
-from .options import DEFAULT_COMPRESSION
+from .formats import DEFAULT_COMPRESSION
 
 GZIP_MAGIC = b"\x1f\x8b"
 #: How a member of deflate begins that has no fields but the ten bytes of its head, and one with a comment behind these,

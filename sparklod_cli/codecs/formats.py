@@ -148,6 +148,15 @@ FORMATS = (
 #: The formats that can be written, by how the name of the file ends, see `Format.endings`.
 WRITABLE = {ending: form for form in FORMATS for ending in form.endings}
 
+#: SPZ versions that can be written, those that hold trees, and the default; see docs/decisions/05-spz.md.
+SPZ_VERSIONS, TREE_SPZ_VERSIONS, DEFAULT_SPZ_VERSION = (2, 3, 4), (2, 3), 3
+
+#: Largest number of fractional bits of an SPZ position.
+MAX_FRACTIONAL_BITS = 24
+
+#: Deflate levels, and the default; measured in docs/decisions/05-spz.md.
+MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
+
 #: Layouts that `--encoding` knows, see `gpu.dump.pack`; docs/formats/memory.md has the arrays of each.
 ENCODINGS = ("packed", "ext", "lodtree", "texture")
 

@@ -6,18 +6,17 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ..system.setting_fields import CheckedSettings, Quantity, setting, whole
+from .formats import (
+    DEFAULT_COMPRESSION,
+    DEFAULT_SPZ_VERSION,
+    MAX_COMPRESSION,
+    MAX_FRACTIONAL_BITS,
+    MIN_COMPRESSION,
+    SPZ_VERSIONS,
+)
 
 if TYPE_CHECKING:
     from .spark_codings import SplatEncoding
-
-#: SPZ versions that can be written, those that hold trees, and the default; see docs/decisions/05-spz.md.
-SPZ_VERSIONS, TREE_SPZ_VERSIONS, DEFAULT_SPZ_VERSION = (2, 3, 4), (2, 3), 3
-
-#: Largest number of fractional bits of an SPZ position.
-MAX_FRACTIONAL_BITS = 24
-
-#: Deflate levels, and the default; measured in docs/decisions/05-spz.md.
-MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 
 #: Entries of a palette of spherical harmonics: Spark's labels have 16 bits.
 MAX_SH_CODES = 65_536

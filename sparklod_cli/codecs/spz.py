@@ -30,7 +30,7 @@ from ..system.errors import FormatError, MembersError, NotSplatsError, Truncated
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, ordered_map
 from . import compression, quantize
-from .options import DEFAULT_SPZ_VERSION, DEFAULTS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WriteOptions
+from .formats import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
 from .quantize import ALL_BITS, Bytes
 from .reader import FileNote, OpenFile, Read, Reader, Scratch, Target, comment_of, read_comment, rows_of
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from ..model.node_stream import NodeStream
     from .encoder import CodeRange, Encoded, Windows
     from .inflate import Inflate
+    from .options import WriteOptions
     from .statistics import Statistics
 
 MAGIC = 0x5053474E  # "NGSP"
@@ -665,7 +666,7 @@ def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
 
 
 def encode(
-    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
+    scene: Scene, options: WriteOptions | None = None, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
     """Return the bytes of a file, piece by piece: an LoD file if the scene has a tree, otherwise a plain one.
 
@@ -675,8 +676,9 @@ def encode(
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
     from .encoder import results
+    from .options import DEFAULTS
 
-    of_scene = encoder(scene, settled(scene, options))
+    of_scene = encoder(scene, settled(scene, options or DEFAULTS))
     windows = list(results(of_scene, scene, threads, progress, "encoding"))
     yield from of_scene.pieces(lambda number, name: windows[number][name], threads=threads, progress=progress)
 

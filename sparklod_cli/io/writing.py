@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path, PurePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..codecs.formats import (
     MANIFEST,
@@ -20,12 +20,14 @@ from ..codecs.formats import (
     rad_chunk_number,
     sog_image_number,
 )
-from ..codecs.options import WriteOptions
 from ..model.scene import Scene
 from ..system.addresses import Place
 from ..system.errors import FormatError
 from ..system.output import Files, Output, Siblings, real_target
 from ..system.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from ..codecs.options import WriteOptions
 
 
 def _named_by_manifest(target: Place) -> Iterator[str]:
