@@ -18,8 +18,7 @@ from ..model.splats import Splats
 from ..render.color_scales import depth_scale
 from ..system.errors import SparklodError, optional_import
 from ..system.units import count_of, percent_of
-from ..tables.columns import Row
-from ..tables.row_statistics import numbers, totals
+from ..tables.columns import Row, numbers, totals
 from .pyvista_scene import Points, PyvistaStage, Viewpoint, bounds, box_lines, evenly, is_drawable, viewpoint, write_png
 
 #: Colours of the series: stops of the colour scales of `render.color_scales`, and pink for marks.
@@ -80,17 +79,16 @@ def load_matplotlib() -> ModuleType:
     return matplotlib
 
 
-def style() -> dict[str, Any]:
-    """Matplotlib's parameters for charts in the colours of the rendered figures."""
-    return {
-        "axes.edgecolor": LINE, "axes.facecolor": PANEL, "axes.labelcolor": FAINT, "axes.titlecolor": INK,
-        "axes.labelsize": 10, "axes.titlesize": 12, "axes.titlelocation": "left", "axes.titlepad": 8,
-        "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True,
-        "axes.grid": True, "grid.color": LINE, "grid.alpha": 0.22, "grid.linewidth": 0.8,
-        "xtick.color": FAINT, "ytick.color": FAINT, "xtick.labelsize": 9.5, "ytick.labelsize": 9.5,
-        "legend.fontsize": 9.5, "legend.frameon": False, "legend.labelcolor": FAINT,
-        "figure.facecolor": BACKGROUND,
-    }  # fmt: skip
+#: Matplotlib's parameters for charts in the colours of the rendered figures.
+STYLE = {
+    "axes.edgecolor": LINE, "axes.facecolor": PANEL, "axes.labelcolor": FAINT, "axes.titlecolor": INK,
+    "axes.labelsize": 10, "axes.titlesize": 12, "axes.titlelocation": "left", "axes.titlepad": 8,
+    "axes.spines.top": False, "axes.spines.right": False, "axes.axisbelow": True,
+    "axes.grid": True, "grid.color": LINE, "grid.alpha": 0.22, "grid.linewidth": 0.8,
+    "xtick.color": FAINT, "ytick.color": FAINT, "xtick.labelsize": 9.5, "ytick.labelsize": 9.5,
+    "legend.fontsize": 9.5, "legend.frameon": False, "legend.labelcolor": FAINT,
+    "figure.facecolor": BACKGROUND,
+}  # fmt: skip
 
 
 def draw(lines: int, height: int, fill: Callable[[ModuleType, NDArray[Any]], None]) -> NDArray[np.uint8]:
@@ -101,7 +99,7 @@ def draw(lines: int, height: int, fill: Callable[[ModuleType, NDArray[Any]], Non
     matplotlib = load_matplotlib()
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
-        matplotlib.rcParams.update(style())
+        matplotlib.rcParams.update(STYLE)
         figure = matplotlib.figure.Figure((WIDTH / DPI, height * lines / DPI), DPI, layout="constrained")
         canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
         figure.get_layout_engine().set(rect=(0.012, 0.008, 0.976, 0.992), wspace=0.05, hspace=0.05)

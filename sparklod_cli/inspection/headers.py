@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import statistics
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..codecs.merging import Chunk
-from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16, PROPERTIES
+from ..codecs.rad.property_codings import CODINGS, LARGEST_F16, PROPERTIES
 from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
@@ -135,47 +134,38 @@ class RadFacts:
 def survey_rad(file: BinaryIO, open_companion: OpenCompanion, *, check: bool) -> HeaderScan:
     """Read the headers of a RAD file and of its chunks, and to `check` them the padding of properties."""
     header, violations = scan_header(file, open_companion)
-    gathered = _Gathered()
+    chunks: list[RadChunkHeader] = []
     if not any(each.fatal for each in violations):
         for chunk, broken in scan_chunks(file, open_companion, header, paddings=check):
             violations += broken
-            if chunk is not None:
-                gathered.add(chunk)
+            chunks += [] if chunk is None else [chunk]
     if any(each.fatal for each in violations):
         return HeaderScan("rad", violations)
-    facts, noted = _rad_facts(header, gathered), header.noted
+    facts, noted = _rad_facts(header, chunks), header.noted
     head = Head(header.format, facts.bytes, header.count, header.max_sh, noted.antialiased, noted.up)
     return HeaderScan("rad", violations, head, facts)
 
 
-@dataclass
-class _Gathered:
-    """Properties of the chunks so far, by name."""
-
-    encodings: dict[str, dict[str, None]] = field(default_factory=dict)
-    bytes: Counter[str] = field(default_factory=Counter)
-    low: dict[str, float] = field(default_factory=dict)
-    high: dict[str, float] = field(default_factory=dict)
-
-    def add(self, chunk: RadChunkHeader) -> None:
-        for each in chunk.properties:
-            if each.name not in BY_NAME or each.encoding not in CODINGS:
-                continue  # a finding says so
-            self.encodings.setdefault(each.name, {})[each.encoding] = None
-            self.bytes[each.name] += each.bytes
-            if each.min is not None:
-                self.low[each.name] = min(each.min, self.low.get(each.name, each.min))
-            if each.max is not None:
-                self.high[each.name] = max(each.max, self.high.get(each.name, each.max))
-
-
-def _rad_facts(header: RadHeader, gathered: _Gathered) -> RadFacts:
+def _rad_facts(header: RadHeader, chunks: Sequence[RadChunkHeader]) -> RadFacts:
     sizes = [entry.bytes for entry in header.chunks]
     total = header.bytes + sum(sizes)
     ranges = None
     if header.encoding is not None:
         ranges = {key: getattr(header.encoding, name) for key, name in ENCODING_KEYS.items()}
-    names = [row.name for row in PROPERTIES if row.name in gathered.encodings]
+    properties = {}
+    for name in (row.name for row in PROPERTIES):  # a finding reports unknown names and encodings
+        found = [
+            each for chunk in chunks for each in chunk.properties if each.name == name and each.encoding in CODINGS
+        ]
+        if found:
+            bytes_ = sum(each.bytes for each in found)
+            properties[name] = PropertyFacts(
+                encoding=", ".join(dict.fromkeys(each.encoding for each in found)),
+                bytes=bytes_,
+                share=round(bytes_ / total, 4),
+                min=min((each.min for each in found if each.min is not None), default=None),
+                max=max((each.max for each in found if each.max is not None), default=None),
+            )
     return RadFacts(
         chunked=header.chunked,
         bytes=total,
@@ -186,16 +176,7 @@ def _rad_facts(header: RadHeader, gathered: _Gathered) -> RadFacts:
         palette=header.sh_code_count or 0,
         ranges=ranges,
         comment=_line(header.comment),
-        properties={
-            name: PropertyFacts(
-                encoding=", ".join(gathered.encodings[name]),
-                bytes=gathered.bytes[name],
-                share=round(gathered.bytes[name] / total, 4),
-                min=gathered.low.get(name),
-                max=gathered.high.get(name),
-            )
-            for name in names
-        },
+        properties=properties,
     )
 
 

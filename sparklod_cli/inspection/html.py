@@ -30,9 +30,6 @@ SEVERITIES = (ERROR, WARNING, NOTE)
 #: Most findings of a file that are listed; checks have some forty kinds, but a file of expectations has no limit.
 MAX_FINDINGS = 200
 
-#: Fields of a header that the page shows, by name, and their titles.
-HEADER = {"version": "Version", "fractional_bits": "Fractional bits"}
-
 #: Titles of keys that say too little with blanks for their underscores.
 LABELS = {
     "first_bytes": "Size needed for a first picture",
@@ -113,7 +110,11 @@ def page(sections: Sequence[FileSection]) -> str:
     contents = ""
     if not one:
         head = ("File", "Format", "Splats", "Size", "Findings")
-        rows = [_overview(section.report, number) for number, section in enumerate(sections, 1)]
+        rows = []
+        for number, report in enumerate((section.report for section in sections), 1):
+            name = f'<a href="#file-{number}">{_text(report.get("file", number))}</a>'
+            shown = (_shown(key, report.get(key)) for key in ("format", "splats", "bytes"))
+            rows.append([name, *shown, _verdict(report)])
         contents = f'<nav class="panel" aria-label="Files">{_table(head, rows, "The files")}</nav>\n'
     body = "\n".join(_section(section, f"file-{number}") for number, section in enumerate(sections, 1))
     return f"""<!DOCTYPE html>
@@ -136,12 +137,6 @@ def page(sections: Sequence[FileSection]) -> str:
 </body>
 </html>
 """
-
-
-def _overview(report: Mapping[str, Any], number: int) -> list[str]:
-    name = f'<a href="#file-{number}">{_text(report.get("file", number))}</a>'
-    cells = [_shown(key, report.get(key)) for key in ("format", "splats", "bytes")]
-    return [name, *cells, _verdict(report)]
 
 
 def _section(section: FileSection, anchor: str) -> str:
@@ -192,7 +187,8 @@ def _figures(report: Mapping[str, Any]) -> str:
     titles = {"splats": f"{noun.title()}s", "bytes": "Size"}
     titles |= {key: key.title() for key in ("leaves", "inner", "growth", "depth", "chunks") if tree}
     titles |= {"inner": "Inner nodes"} if tree else {}
-    titles |= {"sh_degree": "SH degree", "antialiased": "Antialiased", "up": "Up"} | HEADER
+    titles |= {"sh_degree": "SH degree", "antialiased": "Antialiased", "up": "Up"}
+    titles |= {"version": "Version", "fractional_bits": "Fractional bits"}
     items = []
     for key, value in ((key, {**report, **tree, **header}.get(key)) for key in titles):
         if value is not None or (tree and key in tree):
@@ -391,11 +387,9 @@ def _chart(histogram: Histogram, name: str) -> str:
 
 def children_groups(children: Mapping[str, int]) -> list[tuple[str, int]]:
     """Return numbers of nodes by their number of children: first single numbers, then ranges that double."""
-    if not children:
-        return []
-    most = max(int(number) for number in children)
+    most = max(map(int, children), default=0)
     ranges = [(number, number) for number in range(1, min(SINGLE_CHILDREN, most) + 1)]
-    while ranges[-1][1] < most:
+    while ranges and ranges[-1][1] < most:
         ranges.append((ranges[-1][1] + 1, 2 * ranges[-1][1]))
     ends = [high for _, high in ranges]
     counts = [0] * len(ranges)

@@ -321,7 +321,11 @@ def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], in
     above = np.cumsum(counts[::-1])[::-1]  # nodes of this limit or more
     bucket = max(0, int(np.count_nonzero(above > CHUNK_NODES)) - 1)
     least = float(np.array(bucket << (32 - LIMIT_BITS), np.uint32).view(np.float32)[()])
-    inner = np.concatenate([_large(tree, limit, least, part) for part in parts_of(tree)])
+    large = []
+    for part in parts_of(tree):
+        limits = limit[part]
+        large.append(part.start + np.flatnonzero((tree.child_count[part] > 0) & (limits > 0) & (limits >= least)))
+    inner = np.concatenate(large)
     if len(inner) > CHUNK_NODES:
         limits = limit[inner]
         inner = inner[limits >= -np.partition(-limits, CHUNK_NODES)[CHUNK_NODES]]
@@ -334,9 +338,3 @@ def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], in
     children = np.repeat(start - (np.cumsum(count) - count), count) + np.arange(count.sum())
     nodes = np.concatenate([np.zeros(1, np.int64), children])
     return np.setdiff1d(nodes[nodes < len(tree)], refined), split
-
-
-def _large(tree: LodTree, limit: FloatArray, least: float, part: slice) -> NDArray[np.intp]:
-    """Return the inner nodes of a part whose limits are above 0 and `least` or more."""
-    limits = limit[part]
-    return part.start + np.flatnonzero((tree.child_count[part] > 0) & (limits > 0) & (limits >= least))

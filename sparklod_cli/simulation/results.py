@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from ..system.output import check_writable
-from ..tables.columns import FRAME, Column, Row, TableOutput
-from ..tables.row_statistics import Number, numbers, statistic, totals
+from ..tables.columns import FRAME, Column, Number, Row, TableOutput, numbers, statistic, totals
 
 COLUMNS = (
     *FRAME,

@@ -14,8 +14,7 @@ from typing import Any
 from ..system.errors import SparklodError
 from ..system.units import PREFIXES
 from ..system.untrusted import near, parse_json
-from .columns import Column, Row
-from .row_statistics import STATISTICS, Number, is_statistic, numbers, statistic, totals
+from .columns import STATISTICS, Column, Number, Row, is_statistic, numbers, statistic, totals
 
 SIGNS: dict[str, Callable[[Any, Any], bool]] = {
     "<=": operator.le,

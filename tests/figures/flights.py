@@ -11,8 +11,7 @@ from PIL import Image
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.figures.charts import PathScene, plot
 from sparklod_cli.simulation.results import Extremes, add_extremes, moments_of
-from sparklod_cli.tables.columns import Row
-from sparklod_cli.tables.row_statistics import totals
+from sparklod_cli.tables.columns import Row, totals
 from tests.scenes import random_splats
 
 SIZE = (400, 250)

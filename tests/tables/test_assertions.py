@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.simulation.results import COLUMNS, EMPTY
 from sparklod_cli.tables.assertions import SIGNS, BadAssertionError, Outcome, check, parse
-from sparklod_cli.tables.columns import Row
-from sparklod_cli.tables.row_statistics import STATISTICS
+from sparklod_cli.tables.columns import STATISTICS, Row
 from tests.tables.rows import flight, row
 
 NUMERIC = [column.name for column in COLUMNS if column.kind is not str]
