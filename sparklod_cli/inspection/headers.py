@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..codecs.merging import Chunk
-from ..codecs.rad.property_codings import CODINGS, LARGEST_F16, PROPERTIES
+from ..codecs.rad.property_codings import CODINGS, LARGEST_F16
 from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
@@ -153,16 +153,15 @@ def _rad_facts(header: RadHeader, chunks: Sequence[RadChunkHeader]) -> RadFacts:
     if header.encoding is not None:
         ranges = {key: getattr(header.encoding, name) for key, name in ENCODING_KEYS.items()}
     properties = {}
-    for name in (row.name for row in PROPERTIES):  # a finding reports unknown names and encodings
-        found = [
-            each for chunk in chunks for each in chunk.properties if each.name == name and each.encoding in CODINGS
-        ]
+    for name in BY_NAME:  # a finding reports unknown names and encodings
+        stored = (each for chunk in chunks for each in chunk.properties if each.name == name)
+        found = [each for each in stored if each.encoding in CODINGS]
         if found:
-            bytes_ = sum(each.bytes for each in found)
+            size = sum(each.bytes for each in found)
             properties[name] = PropertyFacts(
                 encoding=", ".join(dict.fromkeys(each.encoding for each in found)),
-                bytes=bytes_,
-                share=round(bytes_ / total, 4),
+                bytes=size,
+                share=round(size / total, 4),
                 min=min((each.min for each in found if each.min is not None), default=None),
                 max=max((each.max for each in found if each.max is not None), default=None),
             )
