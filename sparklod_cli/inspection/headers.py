@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..codecs.merging import Chunk
-from ..codecs.rad.property_codings import CODINGS, LARGEST_F16
+from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16
 from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
