@@ -444,7 +444,10 @@ class Text(click.ParamType):
             parsed = quantity.parse(value)
         except ValueError as error:
             self.fail(str(error), param, ctx)
-        if parsed is not None and quantity.range is not None and parsed not in quantity.range:
+        try:
+            if parsed is not None and quantity.range is not None and abs(parsed) <= MOST_WHOLE:  # or the settings fail
+                quantity.range.check("", parsed)
+        except ValueError:
             self.fail(f"{value!r} is out of range; give {quantity.range}", param, ctx)
         return parsed
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
@@ -21,9 +22,9 @@ from ..codecs.formats import (
     sog_image_number,
 )
 from ..model.scene import Scene
-from ..system.addresses import Place
+from ..system.addresses import Address, Place
 from ..system.errors import FormatError
-from ..system.output import Files, Output, Siblings, real_target
+from ..system.output import Files, Output, Siblings
 from ..system.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def siblings_of(path: Place) -> Siblings:
     """Return the names of the files beside a header: of its format's parts, images of a meta.json, or chunks of RAD."""
     if path.name in (MANIFEST, TILESET):
         return _TILES_3D if path.name == TILESET else _STREAMED_SOG
-    name = real_target(path).name
+    name = path.name if isinstance(path, Address) else Path(os.path.realpath(path)).name
     if META in (path.name.lower(), name.lower()):
         return Siblings(lambda name: sog_image_number(name) is not None)
     return Siblings(lambda each: rad_chunk_number(each, PurePath(name).stem) is not None)

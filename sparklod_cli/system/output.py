@@ -109,7 +109,8 @@ class Output(contextlib.AbstractContextManager["Output"]):
         self, place: Place, *, overwrite: bool, siblings: Siblings | None = None, may_end: bool = False
     ) -> None:
         self.place, self.siblings = place, siblings
-        self.target = real_target(place)
+        #: The place with symbolic links followed.
+        self.target = place if isinstance(place, Address) or place == DASH else Path(os.path.realpath(place))
         self._overwrite, self._may_end = overwrite, may_end
         self._stack = contextlib.ExitStack()
         self._written, self._former = dict[str, None](), list[str]()
@@ -254,11 +255,6 @@ def write_file(place: Place, pieces: Iterable[bytes], *, overwrite: bool, may_en
         return out.write(place.name, pieces)
 
 
-def real_target(place: Place) -> Place:
-    """Return the place of an output, with symbolic links followed."""
-    return place if isinstance(place, Address) or place == DASH else Path(os.path.realpath(place))
-
-
 def check_writable(place: Place, *, overwrite: bool, tried: bool = True) -> None:
     """Raise `OutputError` if a file cannot be written: a folder or another file is in its way, or it has no room.
 
@@ -277,12 +273,11 @@ def check_writable(place: Place, *, overwrite: bool, tried: bool = True) -> None
             raise OutputError(f"{place} is a directory")
         if place.is_file() and not overwrite:
             raise _taken(place)
-        if isinstance(place, Path) and not _is_no_file(place):
-            _nearest_folder(place)
-            if tried:
+        if tried and isinstance(place, Path):
+            if not _is_no_file(place):
                 try_place(place)
-        elif isinstance(place, Path) and tried and not os.access(place, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            elif not os.access(place, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except OSError as error:
         raise OutputError(f"cannot write {place}: {reason_of(error)}") from None
 
@@ -293,7 +288,10 @@ def try_place(path: Path, *, least: int = 0) -> None:
     Permission and room are tried by a temporary file in its folder, or in the nearest existing folder on the way to it.
     """
     try:
-        target, nearest = Path(os.path.realpath(path)), _nearest_folder(path)
+        target = Path(os.path.realpath(path))
+        nearest = next(folder for folder in target.parents if os.path.lexists(folder))
+        if not nearest.is_dir():
+            raise OutputError(f"cannot write {path}: {nearest} is a file, not a folder")
         for name in target.relative_to(nearest).parts:
             with contextlib.suppress(FileNotFoundError):
                 (nearest / name).lstat()  # raises where the file system takes no such name
@@ -308,14 +306,6 @@ def try_place(path: Path, *, least: int = 0) -> None:
         raise OutputError(
             f"cannot write {path}: it takes {format_size(least)} or more, and {format_size(free)} are free there"
         )
-
-
-def _nearest_folder(path: Path) -> Path:
-    """Return the nearest existing folder on the way to a file; raise `OutputError` if that is a file."""
-    nearest = next(folder for folder in Path(os.path.realpath(path)).parents if os.path.lexists(folder))
-    if not nearest.is_dir():
-        raise OutputError(f"cannot write {path}: {nearest} is a file, not a folder")
-    return nearest
 
 
 def _taken(place: Place) -> OutputError:

@@ -37,15 +37,6 @@ class Range:
     whole: bool = False
     unit: str = "X"
 
-    def __contains__(self, number: float) -> bool:
-        return not (
-            number != number
-            or (self.least is not None and number < self.least)
-            or (self.most is not None and number > self.most)
-            or (self.above is not None and number <= self.above)
-            or (self.below is not None and number >= self.below)
-        )
-
     def __str__(self) -> str:
         if self.least is not None:
             return f"{self.least} or more" if self.most is None else f"{self.least} to {self.most}"
@@ -59,7 +50,13 @@ class Range:
         number: Any = value  # abstract numbers have no operators for mypy
         if self.whole and abs(number) > MOST_WHOLE:
             raise ValueError(f"{name} is a number of {len(str(abs(number)))} digits, which is too large")
-        if number not in self:
+        is_inside = (
+            (self.least is None or number >= self.least)
+            and (self.most is None or number <= self.most)
+            and (self.above is None or number > self.above)
+            and (self.below is None or number < self.below)
+        )
+        if not is_inside or number != number:
             raise ValueError(f"{name} is {value}; give {self}")
 
 

@@ -43,6 +43,7 @@ class _GuardedStream:
         self._stream = stream
         self.encoding = getattr(stream, "encoding", None) or "utf-8"
         self.errors = "backslashreplace"  # characters that the terminal cannot show are escaped
+        self.isatty: Callable[[], bool] = bool if stream is None else stream.isatty
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -50,9 +51,6 @@ class _GuardedStream:
     @property
     def buffer(self) -> _GuardedStream:
         return _GuardedStream(self._stream and self._stream.buffer)
-
-    def isatty(self) -> bool:
-        return self._stream is not None and self._stream.isatty()
 
     def write(self, data: Any) -> int:
         if self._stream is None:
