@@ -124,11 +124,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
             pairs: Sequence[Pair] = [(merged_source(options.inputs, instances), options.output)]
         else:
             pairs = [(source, options.target(source)) for source in options.inputs]
-        how: dict[str, Any] = {
-            "overwrite": options.overwrite,
-            "threads": general.threads,
-            "progress": console.progress,
-        }
+        how: dict[str, Any] = {"overwrite": options.overwrite, "threads": general.threads, "progress": console.progress}
         if options.unlod:
             from ..api.bake_jobs import extract_files
 
@@ -422,7 +418,7 @@ def _written(baked: Baked) -> str:
 
 
 def _consequences(baked: Baked) -> str:
-    """Return a line on the visible effect of clamping; empty where nothing of it can be seen."""
+    """Return a line on the visible effects of clamping; empty without any."""
     from ..codecs.encoder import clamp_matters
 
     shares: dict[str, float] = {}

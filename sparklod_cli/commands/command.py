@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import itertools
 import math
@@ -154,11 +155,7 @@ class Command(click.Command):
         return rest
 
     def by_heading(self, ctx: click.Context, *, whole: bool = True) -> dict[str, list[click.Parameter]]:
-        """Return the options that the help lists, by heading, in the order of both.
-
-        Args:
-            whole: all options; otherwise the common ones and the ones that print help.
-        """
+        """Return all options, or the common ones and those that print help, by heading, in the order of both."""
         params = [param for param in self.get_params(ctx) if isinstance(param, click.Option) and not param.hidden]
         if not whole:
             params = [each for each in params if HELP & {*each.opts} or getattr(each, "heading", "") == COMMON]
@@ -202,11 +199,7 @@ def _print_help_all(ctx: click.Context, param: click.Parameter, value: bool) -> 
 
 
 def refuse_output_among_inputs(ctx: click.Context, *, missing: bool = False) -> None:
-    """Raise a `click.UsageError` if the last input seems to be the output, as with cp: it does not exist.
-
-    Args:
-        missing: the command must have an output, and has none.
-    """
+    """Raise a `click.UsageError` if the last input seems to be the output, as with cp: it does not exist."""
     *others, last = ctx.params.get("inputs") or ctx.params.get("files") or (None,)
     if not others or not isinstance(last, Path) or last.exists():
         return
@@ -299,9 +292,8 @@ def help(ctx: click.Context, command: str | None) -> None:
 Options = TypeVar("Options")
 
 
-def flag(help: str, **attributes: Any) -> Any:
-    """Return a field that is an option without a value, see `setting`."""
-    return setting(help, default=False, **attributes)
+#: Makes a field that is an option without a value, see `setting`.
+flag = functools.partial(setting, default=False)
 
 
 def _parameters(group: type[Any], heading: str) -> Iterator[click.Parameter]:
@@ -453,11 +445,7 @@ class Text(click.ParamType):
 
 
 class OptionalNumber(click.IntRange):
-    """A number that may be left out; the error for an input taken for it says what to do.
-
-    Args:
-        zero: a text for 0, which may be out of the range.
-    """
+    """A number that may be left out; `zero` is a text for 0, which may be out of the range."""
 
     def __init__(self, range: Range, *, placeholder: str = "N", example: int, zero: str = "") -> None:
         super().__init__(range.least, range.most)  # type: ignore[arg-type]  # whole numbers
@@ -467,8 +455,7 @@ class OptionalNumber(click.IntRange):
         if self.zero and value == self.zero:
             return 0
         if isinstance(value, str) and not value.lstrip("-").isdigit() and param is not None:
-            flag = param.opts[0]
-            example = f"{flag}={self.example}"
+            flag, example = param.opts[0], f"{param.opts[0]}={self.example}"
             self.fail(f"{value!r} is no number; put {flag} after the inputs, or write {example}", param, ctx)
         number: int = super().convert(value, param, ctx)
         return number

@@ -65,8 +65,12 @@ def doctor(ctx: click.Context, /, **_: Any) -> None:
             about = {"ok": not problems, "checks": [dataclasses.asdict(check) for check in checks]}
             print_json(about, indent=2)
         else:
-            for line in _lines(problems if messages.quiet else checks):
-                click.echo(line)
+            shown = problems if messages.quiet else checks
+            width = max((len(check.name) for check in shown), default=0)
+            for check in shown:
+                click.echo(printable(f"{check.state:<8}{check.name:<{width}}  {check.value}"))
+                if check.advice:
+                    click.echo(" " * (8 + width + 2) + printable(f"-> {check.advice}"))
         console.say(_summary(checks))
     ctx.exit(1 if problems else 0)
 
@@ -75,25 +79,13 @@ def _summary(checks: list[Check]) -> str:
     problems = sum(check.state == "problem" for check in checks)
     notes = [check.name for check in checks if check.state == "note"]
     extras = [name.removeprefix(EXTRA) for name in notes if name.startswith(EXTRA)]
-    others = len(notes) - len(extras)
-    parts = [f"{count_of(problems, 'problem')} to solve before baking works"] if problems else []
+    solve = f"{count_of(problems, 'problem')} to solve before baking works"
+    parts = [solve if problems else "OK: everything that baking needs works"]
     if extras:
         parts.append(f"{count_of(len(extras), 'optional extra')} not installed ({', '.join(extras)})")
-    if others:
-        parts.append(count_of(others, "other note" if extras else "note"))
-    if problems:
-        return "; ".join(parts)
-    return "; ".join(["OK: everything that baking needs works", *parts])
-
-
-def _lines(checks: list[Check]) -> list[str]:
-    width = max((len(check.name) for check in checks), default=0)
-    lines = []
-    for check in checks:
-        lines.append(printable(f"{check.state:<8}{check.name:<{width}}  {check.value}"))
-        if check.advice:
-            lines.append(" " * (8 + width + 2) + printable(f"-> {check.advice}"))
-    return lines
+    if len(notes) > len(extras):
+        parts.append(count_of(len(notes) - len(extras), "other note" if extras else "note"))
+    return "; ".join(parts)
 
 
 #: ok: works. note: something optional is missing, or could be better. problem: baking does not work.
@@ -238,12 +230,12 @@ def _kernels() -> Iterator[Check]:
         yield Check("kernel cache", "note", "no folder can be written to, so every run compiles its kernels", advice)
     else:
         compiled = wanted - about["missing"]
-        value = f"{compiled} of {wanted} kernels are compiled, {_megabytes(_size_of(Path(folder)))} in {folder}"
+        value = f"{compiled} of {wanted} kernels are compiled, {_size_of(Path(folder))} in {folder}"
         advice = "sparklod warmup   # compiles the others now, instead of when they are first used"
         yield _optional("kernel cache", value, advice if about["missing"] else "")
         old = [path for path in Path(folder).parent.glob("kernels-*") if path != Path(folder)]
         if old:
-            value = f"{len(old)} of other versions of sparklod, {_megabytes(sum(map(_size_of, old)))}"
+            value = f"{len(old)} of other versions of sparklod, {_size_of(*old)}"
             advice = f"delete the other kernels-* in {Path(folder).parent}, unless those versions are still used"
             yield _optional("old caches", value, advice)
 
@@ -365,13 +357,9 @@ def _last_line(text: str, code: int) -> str:
     return f"ended by signal {-code}" if code < 0 else f"exit status {code}"
 
 
-def _size_of(folder: Path) -> int:
+def _size_of(*folders: Path) -> str:
     total = 0
-    for path in folder.glob("*"):
+    for path in (path for folder in folders for path in folder.glob("*")):
         with contextlib.suppress(OSError):  # another process has just replaced it
             total += path.stat().st_size
-    return total
-
-
-def _megabytes(size: int) -> str:
-    return f"{size / 1e6:.1f} MB"
+    return f"{total / 1e6:.1f} MB"

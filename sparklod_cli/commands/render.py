@@ -22,17 +22,7 @@ from ..system.units import format_size, parse_time
 from ..viewers.viewer_settings import BLEND, StreamingSettings
 from .command import COLOR, COMMON, VIEW, Command, check_declared, flag, is_set, refuse, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
-from .options.common import (
-    ASSERT,
-    JSON,
-    OUTPUT,
-    OVERWRITE,
-    PNG,
-    General,
-    assert_errors,
-    report_outcomes,
-    table_output,
-)
+from .options.common import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
 from .options.viewing import (
     AROUND_SCENE,
     BUDGET,
@@ -60,11 +50,7 @@ if TYPE_CHECKING:
     from ..tables.assertions import Assertion
 
 #: Options without an effect on some styles and backends.
-UNSTYLED = {
-    "points": ("profile", "sort"),
-    "billboards": ("profile", "sort"),
-    "sorted-billboards": ("profile",),
-}
+UNSTYLED = {"points": ("profile", "sort"), "billboards": ("profile", "sort"), "sorted-billboards": ("profile",)}
 UNKNOWN_TO = {"open3d": ("profile", "sort")}
 
 #: The budgets to compare, unless others are given.
@@ -96,10 +82,7 @@ class PictureCameras(Cameras):
 
     orbit: int | None = setting(f"{AROUND_SCENE}one camera that sees the whole scene]", CAMERAS, heading=COMMON)
     views: tuple[Any, ...] = setting(
-        "Place a camera as --look-at does; several --view make a contact sheet.",
-        VIEW,
-        flags=("--view",),
-        multiple=True,
+        "Place a camera as --look-at does; several --view make a contact sheet.", VIEW, flags=("--view",), multiple=True
     )
 
     still: ClassVar[bool] = True
@@ -264,10 +247,7 @@ EXAMPLES = """\
     --budget 5%,25% --assert '25%:psnr>30'                  # exit status 3
 """
 
-HEADINGS = (
-    *(COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming"),
-    *("Appearance", "Comparison", "Output"),
-)
+HEADINGS = (*(COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming"), *("Appearance", "Comparison", "Output"))
 
 
 @dataclass(frozen=True)

@@ -22,16 +22,7 @@ from ..system.setting_fields import Quantity, Range, setting, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
 from .build_lod import record_of, report_simplified
-from .command import (
-    COMMON,
-    Command,
-    OptionalNumber,
-    check_declared,
-    flag,
-    flags_set,
-    is_set,
-    values_of,
-)
+from .command import COMMON, Command, OptionalNumber, check_declared, flag, flags_set, is_set, values_of
 from .console import Console, print_json, say
 from .options.baking import (
     BY_SIZE,
@@ -49,16 +40,7 @@ from .options.baking import (
     write_options,
 )
 from .options.common import EACH_AS_JSON, JSON, OVERWRITE, General
-from .paths import (
-    NAMELESS,
-    Folder,
-    NamedPath,
-    claim_stdout,
-    keep_apart,
-    require_suffix,
-    stem_of,
-    with_chunks,
-)
+from .paths import NAMELESS, Folder, NamedPath, claim_stdout, keep_apart, require_suffix, stem_of, with_chunks
 
 if TYPE_CHECKING:
     from ..api.bake_jobs import BakeSettings

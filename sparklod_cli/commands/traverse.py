@@ -20,17 +20,7 @@ from ..tables.columns import FORMS
 from ..viewers.viewer_settings import StreamingSettings
 from .command import COMMON, Command, check_declared, flag, refuse, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
-from .options.common import (
-    ASSERT,
-    JSON,
-    OUTPUT,
-    OVERWRITE,
-    PNG,
-    General,
-    assert_errors,
-    report_outcomes,
-    table_output,
-)
+from .options.common import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
 from .options.viewing import Cameras, CutOptions, Inputs, check_view, files_read
 from .paths import NamedPath, claim_stdout, keep_apart, name_outputs
 
@@ -251,7 +241,9 @@ def lines(summary: Summary) -> Iterator[str]:
     """Yield the lines of a summary."""
     yield from rows("path", f"{count_of(summary.frames, 'frame')}, {summary.seconds:.3f} s")
     if summary.stop_reasons:
-        stops = (f"{_share(share)} {STOPS.get(reason, reason)}" for reason, share in summary.stop_reasons.items())
+        stops = (
+            f"{_said(share, 'share')} {STOPS.get(reason, reason)}" for reason, share in summary.stop_reasons.items()
+        )
         yield from rows("stops", ", ".join(stops))
     if summary.chunks:
         first = f"{format_size(summary.bytes_first)} in {count_of(summary.chunks_first, 'chunk')} for the first frame"
@@ -288,7 +280,7 @@ def _said(value: float, style: str) -> str:
     if style == "count":
         return f"{round(value):,}"
     if style == "share":
-        return _share(value)
+        return f"{100 * value:.1f} %"
     if style == "bytes":
         return format_size(round(value)) if value else "0"
     if style == "seconds":
@@ -296,7 +288,3 @@ def _said(value: float, style: str) -> str:
     if style == "ms":
         return f"{value:.2f} ms"
     return f"{value:.1f}" if style == "fixed" else f"{value:.4g}"
-
-
-def _share(value: float) -> str:
-    return f"{100 * value:.1f} %"

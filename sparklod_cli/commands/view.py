@@ -145,7 +145,10 @@ def view(ctx: click.Context, /, **_: Any) -> None:
         if place.export is not None:
             size = viewing.export(site, place.export, overwrite=place.overwrite, progress=console.progress)
             console.clear()
-            _report_export(console, place.export, site, size, as_json=options.as_json)
+            count = count_of(len(site.resources), "file")
+            console.say(f"wrote {printable(str(place.export))}: {count}, {format_size(size)}")
+            if options.as_json:
+                print_json({"folder": str(place.export), "bytes": size, "files": _files(site)})
         else:
             server = viewing.Server(site, host=place.host, port=place.port, cors=place.cors, log=console.detail)
             _serve(console, server, opens=not place.no_open, as_json=options.as_json)
@@ -176,12 +179,6 @@ def _open(console: Console, url: str) -> None:
     )
     if not has_display or not webbrowser.open(url):
         console.say(f"Could not open a browser; open this address yourself: {url}")
-
-
-def _report_export(console: Console, folder: Path, site: Site, size: int, *, as_json: bool) -> None:
-    console.say(f"wrote {printable(str(folder))}: {count_of(len(site.resources), 'file')}, {format_size(size)}")
-    if as_json:
-        print_json({"folder": str(folder), "bytes": size, "files": _files(site)})
 
 
 def _files(site: Site) -> list[dict[str, Any]]:

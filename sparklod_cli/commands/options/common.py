@@ -38,11 +38,7 @@ JSON: dict[str, Any] = {"flags": ("--json",), "heading": GENERAL}
 QUIET: dict[str, Any] = {"flags": ("-q", "--quiet")}
 VERBOSE: dict[str, Any] = {"flags": ("-v", "--verbose")}
 OUTPUT: dict[str, Any] = {"flags": ("-o", "--output"), "heading": COMMON}
-OVERWRITE: dict[str, Any] = {
-    "help": "Replace outputs that exist.",
-    "flags": ("-f", "--overwrite"),
-    "heading": COMMON,
-}
+OVERWRITE: dict[str, Any] = {"help": "Replace outputs that exist.", "flags": ("-f", "--overwrite"), "heading": COMMON}
 ASSERT: dict[str, Any] = {"flags": ("--assert",), "metavar": "TEXT", "multiple": True}
 
 #: Type of a picture of a table or of a file.

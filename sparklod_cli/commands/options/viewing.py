@@ -19,15 +19,7 @@ from ...system.errors import CameraPathError, TooManyCamerasError
 from ...system.setting_fields import Quantity, Range, setting, whole
 from ...system.units import check_grouping
 from ...system.untrusted import printable
-from ...viewers.viewer_settings import (
-    BLEND,
-    FACTOR,
-    PLAYCANVAS_BUDGET,
-    PRESETS,
-    DetailRule,
-    LodSettings,
-    Network,
-)
+from ...viewers.viewer_settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS, DetailRule, LodSettings, Network
 from ..command import COMMON, DIRECTION, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, parameters_of, refuse
 from ..paths import NamedPath, file_of
 from .common import DEFAULT_UP, UP
@@ -131,8 +123,7 @@ class Cameras:
         metavar="MATRIX",
     )
     fov: float | None = setting(
-        "Vertical field of view, in degrees.  [default: the file's, or 60]",
-        Range(above=0, below=180, unit="DEGREES"),
+        "Vertical field of view, in degrees.  [default: the file's, or 60]", Range(above=0, below=180, unit="DEGREES")
     )
     seconds: float | None = setting(
         "Duration of --orbit, of --dolly, and of --keyframes from one view to the next, in seconds.  [default: 2; of"
@@ -230,10 +221,7 @@ OF_PIXELS = ("lod_render_scale", "pixel_scale_limit")
 
 #: Options of the foveation cones, which --outside-foveate replaces, and of nodes, which Streamed SOG does not have.
 CONES = ("cone_fov0", "cone_fov", "cone_foveate")
-NODES = (
-    *(*OF_PIXELS, *CONES, "outside_foveate", "behind_foveate"),
-    *("precision", "continuous", "blend"),
-)
+NODES = (*(*OF_PIXELS, *CONES, "outside_foveate", "behind_foveate"), *("precision", "continuous", "blend"))
 
 #: Options of cuts, which have no effect where full detail is drawn.
 CUTS = ("budget", "preset", "lod_splat_scale", *NODES)
@@ -302,9 +290,7 @@ class CutOptions:
         "Full angle of the inner foveation cone, in degrees: full priority inside it.", DEGREES, CONE_FOV0
     )
     cone_fov: float = setting(
-        "Full angle of the outer cone, in degrees, where priority has fallen to --cone-foveate.",
-        DEGREES,
-        CONE_FOV,
+        "Full angle of the outer cone, in degrees, where priority has fallen to --cone-foveate.", DEGREES, CONE_FOV
     )
     cone_foveate: float = setting(f"Priority of nodes at the outer cone, {PRIORITY}.", FACTOR, CONE_FOVEATE)
     outside_foveate: float | None = setting(
@@ -313,8 +299,7 @@ class CutOptions:
         excludes=CONES,
     )
     behind_foveate: float | None = setting(
-        f"Priority of nodes behind the camera.  [default: {BEHIND_FOVEATE:g}; 1 with --outside-foveate]",
-        FACTOR,
+        f"Priority of nodes behind the camera.  [default: {BEHIND_FOVEATE:g}; 1 with --outside-foveate]", FACTOR
     )
     precision: str = setting(
         "Precision of the centres and sizes that cuts are found with: the file's, its half floats, or what Spark has of"
