@@ -103,7 +103,8 @@ class PlyHeader:
     Attributes:
         elements: descriptions of the elements without their data, by name.
         counts: numbers of their rows.
-        row_types: types of their rows; None if rows have lists, and so no fixed size.
+        row_types: types of their rows, without `PREFIX` before names, in ascii files of floats alone; None if rows have
+            lists, and so no fixed size.
         text: whether the data are ascii.
         size: bytes of the header.
         note: the first comment that is a JSON object; empty without one.
@@ -169,12 +170,17 @@ def read_header(file: BinaryIO) -> PlyHeader:
     except (PlyParseError, ValueError) as error:
         raise FormatError(f"bad PLY header: {quoted(error)}") from None
     elements = {element.name: element for element in parsed}
-    row_types = {
-        element.name: None
-        if any(isinstance(each, PlyListProperty) for each in element.properties)
-        else np.dtype(element.dtype(parsed.byte_order))
-        for element in parsed
-    }
+    row_types = dict[str, np.dtype[Any] | None]()
+    for element in parsed:
+        fields = {}
+        names = {each.name for each in element.properties}
+        for each in element.properties:
+            plain, kind = each.name.removeprefix(PREFIX) or each.name, np.dtype(each.dtype(parsed.byte_order))
+            if parsed.text and kind.itemsize < 8:
+                kind = np.dtype("<f4")  # programs write "200.0" where the header announces a whole number
+            fields[each.name if plain in names else plain] = kind
+        has_lists = any(isinstance(each, PlyListProperty) for each in element.properties)
+        row_types[element.name] = None if has_lists else np.dtype([*fields.items()])
     named_counts = {element.name: count for element, count in zip(parsed, counts, strict=True)}
     return PlyHeader(elements, named_counts, row_types, parsed.text, parsed.byte_order, len(text), note, mode)
 
@@ -228,7 +234,11 @@ def open_content(source: OpenFile) -> Reader:
     """Open a PLY file. An ascii file is unpacked to `scratch`, as binary rows."""
     file = source.file
     header = read_header(file)
-    row_type = _row_type(header)
+    if "vertex" not in header.elements:
+        raise NotSplatsError("its PLY header has no element vertex")
+    row_type = header.row_types["vertex"]
+    if row_type is None:
+        raise NotSplatsError("its vertices have list properties, which splats do not have")
     names = row_type.names or ()
     columns = _columns(names, header.mode)
     numbered = sum(1 for name in names if re.fullmatch(r"f_rest_\d+", name))
@@ -351,22 +361,6 @@ def _places(names: Sequence[str], parts: Sequence[str]) -> Places:
     first = places[0] if places else 0
     run = slice(first, first + len(places))
     return run if places == list(range(run.start, run.stop)) else places
-
-
-def _row_type(header: PlyHeader) -> np.dtype[Any]:
-    """Return the type of a vertex: in ascii files of floats alone, without `PREFIX` before names."""
-    if "vertex" not in header.elements:
-        raise NotSplatsError("its PLY header has no element vertex")
-    row_type = header.row_types["vertex"]
-    if row_type is None:
-        raise NotSplatsError("its vertices have list properties, which splats do not have")
-    fields = []
-    for name in row_type.names or ():
-        plain, kind = name.removeprefix(PREFIX), row_type[name]
-        if header.text and kind.itemsize < 8:
-            kind = np.dtype("<f4")  # programs write "200.0" where the header announces a whole number
-        fields.append((name if plain in (row_type.names or ()) else plain, kind))
-    return np.dtype(fields)
 
 
 def _text_rows(file: BinaryIO, header: PlyHeader, row_type: np.dtype[Any], needed: Collection[str]) -> Iterator[Rows]:
