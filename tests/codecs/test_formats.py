@@ -41,8 +41,8 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
     assert hasattr(codec, "encoder") == hasattr(codec, "needed") == form.trees
     if form.trees:
         assert parameters(codec.needed) == {"options": False}
-        named = {"threads": True, "progress": True}
-        assert parameters(codec.encoder) == {"scene": False, "options": False, "ranges": False} | named
+        named = {"counting": True, "threads": True, "progress": True}
+        assert parameters(codec.encoder) == {"scene": False, "options": False} | named
 
 
 def test_one_format_is_written_by_each_suffix() -> None:
