@@ -155,7 +155,7 @@ def test_files_are_read_with_the_bytes_of_their_chunks(row: DetailScene, tmp_pat
         assert loaded.files.environment == 9 and loaded.files.manifest == manifest.stat().st_size
         folders = [*(f"{level}_{number}" for level in range(3) for number in range(3)), "env"]
         sizes = [sum(each.stat().st_size for each in (manifest.parent / name).iterdir()) for name in folders]
-        assert loaded.chunk_bytes().tolist() == sizes and loaded.bytes == sum(sizes) + manifest.stat().st_size
+        assert [sum(each) for each in loaded.requests] == sizes and loaded.bytes == sum(sizes) + manifest.stat().st_size
         np.testing.assert_array_equal(loaded.detail.counts, row.counts)
 
 

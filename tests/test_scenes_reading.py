@@ -154,7 +154,7 @@ def test_a_file_is_opened_once(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_chunks_share_the_bytes_of_a_file() -> None:
     made = read_scenes(five())
     for tree in made.with_cuts:
-        sizes = tree.chunk_bytes()
+        sizes = np.array([sum(each) for each in tree.requests])
         assert tree.file is not None
         assert sizes.sum() == tree.bytes == tree.file.stat().st_size
         assert len(sizes) == -(-len(tree.splats) // CHUNK_NODES)
@@ -172,10 +172,10 @@ def test_chunks_of_rad_have_the_sizes_that_they_have_in_the_file(tmp_path: Path)
     whole, parts, town = read_scenes(
         [Instance(path) for path in (tmp_path / "whole.rad", tmp_path / "parts.rad", TOWN)]
     ).loaded
-    assert whole.scene.header["header_bytes"] + whole.chunk_bytes().sum() == (tmp_path / "whole.rad").stat().st_size
+    assert whole.scene.header["header_bytes"] + sum(map(sum, whole.requests)) == (tmp_path / "whole.rad").stat().st_size
     assert parts.scene.header["header_bytes"] == (tmp_path / "parts.rad").stat().st_size
     files = [(tmp_path / f"parts-{number}.radc").stat().st_size for number in range(3)]
-    assert parts.chunk_bytes().tolist() == whole.chunk_bytes().tolist() == files
+    assert [sum(each) for each in parts.requests] == [sum(each) for each in whole.requests] == files
     assert town.headers == ()
 
 
@@ -184,14 +184,14 @@ def test_chunks_of_another_size_than_sparks_are_not_those_that_it_streams() -> N
     (tree,) = read_scenes([Instance(FIXTURES / "golden" / "sh1-tree.rad")]).with_cuts
     assert tree.scene.chunk_bytes is not None
     assert tree.scene.header["chunk_size"] != CHUNK_NODES
-    assert tree.chunk_bytes().tolist() == [tree.bytes]
+    assert [sum(each) for each in tree.requests] == [tree.bytes]
     assert tree.headers == ()
 
 
 @pytest.mark.parametrize("nodes", [1, CHUNK_NODES - 1, CHUNK_NODES, CHUNK_NODES + 1, 3 * CHUNK_NODES])
 def test_chunks_end_where_nodes_do(nodes: int) -> None:
     (tree,) = read_scenes([Instance(TREE, "tree")]).with_cuts
-    sizes = dataclasses.replace(tree, splats=Splats.zeros(nodes, 0), bytes=10**12 + 7).chunk_bytes()
+    sizes = np.array(dataclasses.replace(tree, splats=Splats.zeros(nodes, 0), bytes=10**12 + 7).requests)
     assert len(sizes) == -(-nodes // CHUNK_NODES)
     assert sizes.sum() == 10**12 + 7
     assert sizes.min() > 0

@@ -162,12 +162,8 @@ def orbit_frames(
 
     `distance` is in world units, `elevation` an angle above the point, radians, `up` the (3,) axis of the orbit.
     """
-    axis = normalized(up)
-    front = _front(axis)
-    side = np.cross(axis, front)
-    turn = 2 * math.pi * numbers[:, None] / count
-    offset = math.cos(elevation) * (np.cos(turn) * front + np.sin(turn) * side) + math.sin(elevation) * axis
-    return _looking_at(center, np.full(len(numbers), distance), offset, axis)
+    turn = 2 * math.pi * numbers / count
+    return _frames_around(center, np.full(len(numbers), distance), turn, elevation, up)
 
 
 def dolly_frames(
@@ -178,24 +174,23 @@ def dolly_frames(
     It grows by the same factor from frame to frame. `far` and `near` are distances of the first and the last frame,
     world units; `center`, `elevation` and `up` as in `orbit_frames`.
     """
-    axis = normalized(up)
-    offset = math.cos(elevation) * _front(axis) + math.sin(elevation) * axis
     away = far * (near / far) ** (numbers / (count - 1))
-    return _looking_at(center, away, np.broadcast_to(offset, (len(numbers), 3)), axis)
+    return _frames_around(center, away, np.zeros(len(numbers)), elevation, up)
 
 
-def _looking_at(center: ArrayLike, distance: Matrix, offset: Matrix, up: Matrix) -> list[Frame]:
-    """Return N frames that look at a point, (3,), from (N,) distances along (N, 3) unit vectors."""
-    target = np.asarray(center, np.float64)
+def _frames_around(center: ArrayLike, distance: Matrix, turn: Matrix, elevation: float, up: ArrayLike) -> list[Frame]:
+    """Return N frames that look at a point, (3,), from (N,) distances, turned by (N,) radians from its front.
+
+    A scene is seen first from the front: from -z if -y is up, from +z if y is up, from -y if z is up.
+    """
+    axis, target = normalized(up), np.asarray(center, np.float64)
+    across = np.cross([1.0, 0.0, 0.0], axis)
+    front = normalized(across if np.linalg.norm(across) > 1e-6 else np.cross([0.0, 1.0, 0.0], axis))
+    side, turn = np.cross(axis, front), turn[:, None]
+    offset = math.cos(elevation) * (np.cos(turn) * front + np.sin(turn) * side) + math.sin(elevation) * axis
     with np.errstate(over="ignore", invalid="ignore"):
         eyes = target + distance[:, None] * offset
-    return [frame_looking(eye, target, up) for eye in eyes]
-
-
-def _front(up: Matrix) -> Matrix:
-    """(3,) direction from which a scene is seen first: -z if -y is up, +z if y is up, -y if z is up."""
-    across = np.cross([1.0, 0.0, 0.0], up)
-    return normalized(across if np.linalg.norm(across) > 1e-6 else np.cross([0.0, 1.0, 0.0], up))
+    return [frame_looking(eye, target, axis) for eye in eyes]
 
 
 def orbit(
@@ -274,12 +269,11 @@ def single_views(views: Sequence[tuple[Point, Point]], settings: Settings, *, na
 
     `named` cameras are called after their eye and target.
     """
-    cameras: list[Camera] = []
+    frames = []
     for view in views:
-        path = cameras_of([frame_looking(*view, settings.up_axis)], settings, "one view")
         name = " to ".join(", ".join(f"{x:g}" for x in point) for point in view) if named else ""
-        cameras.append(dataclasses.replace(path.cameras[0], name=name))
-    return dataclasses.replace(path, cameras=tuple(cameras), numbers=tuple(range(len(cameras))))
+        frames.append(frame_looking(*view, settings.up_axis, time=0.0, name=name))
+    return cameras_of(frames, dataclasses.replace(settings, fps=None, every=1), "one view")
 
 
 def keyframes(views: Sequence[tuple[Point, Point]], seconds: float, settings: Settings) -> CameraPath:

@@ -177,35 +177,29 @@ class Simulation(StreamedCuts):
             "budget": settings.budget,
             "pixel_scale_limit": settings.limit(camera.fov_y, camera.height),
         }
-        selected, retained, before = (None if None in column else sum(column) for column in zip(*changes, strict=True))
-        assert selected is not None and before is not None
-        total = where | {"instance": TOTAL} | _cells(whole, settings.budget, selected, retained, before)
-        total |= {
+        now, kept, then = zip(*changes, strict=True)
+        total = sum(now), None if None in kept else sum(kept), sum(then)
+        names = (instance.name for instance in self.scenes.instances)
+        of_instances = zip(names, parts, changes, strict=True) if parts else ()
+        rows = list[Row]()
+        for name, measured, (selected, retained, before) in [(TOTAL, whole, total), *of_instances]:
+            added, removed, churn = selected, 0, None
+            if retained is not None:
+                added, removed = selected - retained, before - retained
+                churn = (added + removed) / (selected + before) if selected + before else 0.0
+            cells = {"added": added, "removed": removed, "churn": churn}
+            cells |= {
+                "interior": measured.selected - measured.leaves,
+                "budget_used": measured.selected / settings.budget,
+            }
+            rows.append(where | {"instance": name} | vars(measured) | cells)
+        rows[0] |= {
             "stop_reason": cut.reason,
             "pixel_scale_min": cut.least,
             "missing": cut.missing,
             "traverse_ms": 1000 * cut.seconds,
         }
-        if not parts:
-            return [total]
-        return [
-            total,
-            *(
-                where | {"instance": instance.name} | _cells(part, settings.budget, *change)
-                for instance, part, change in zip(self.scenes.instances, parts, changes, strict=True)
-            ),
-        ]
-
-
-def _cells(measured: CutStatistics, budget: int, selected: int, retained: int | None, before: int) -> Row:
-    """Return the cells of a cut, and of its changes since the last one; `retained` is None for the first cut."""
-    cells: Row = {"interior": measured.selected - measured.leaves, "budget_used": measured.selected / budget}
-    cells |= vars(measured)
-    if retained is None:
-        return cells | {"added": selected, "removed": 0, "churn": None}
-    added, removed = selected - retained, before - retained
-    churn = (added + removed) / (selected + before) if selected + before else 0.0
-    return cells | {"added": added, "removed": removed, "churn": churn}
+        return rows
 
 
 def write_frames(

@@ -59,10 +59,12 @@ class LoadedTiles(LoadedScene):
     def chunk_of(self, index: Index) -> NDArray[np.int64]:
         return self.first_chunk + np.searchsorted(np.cumsum(self.tiles.counts), index, side="right")
 
-    def chunk_bytes(self) -> NDArray[np.int64]:
-        if self.tiles.sizes is not None:
-            return self.tiles.sizes
-        return bytes_of(self.splats) * self.tiles.counts // max(1, self.count)
+    @property
+    def requests(self) -> Sequence[tuple[int, ...]]:
+        sizes = self.tiles.sizes
+        if sizes is None:
+            sizes = bytes_of(self.splats) * self.tiles.counts // max(1, self.count)
+        return [(size,) for size in sizes.tolist()]
 
 
 @dataclass(frozen=True, eq=False)

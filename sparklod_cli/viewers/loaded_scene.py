@@ -125,17 +125,16 @@ class LoadedScene:
         """Return the (M,) numbers of the chunks that some splats are in, where the chunks of all scenes are counted."""
         return self.first_chunk + index // CHUNK_NODES
 
-    def chunk_bytes(self) -> NDArray[np.int64]:
-        """Return the (chunks,) bytes of each; without chunks of its own (SPZ) as if the file were cut evenly."""
-        if self.has_chunks:
-            return np.array(self.scene.chunk_bytes, np.int64)
-        ends = np.minimum(np.arange(1, self.chunks + 1) * CHUNK_NODES, self.count)
-        return np.diff(ends * self.bytes // self.count, prepend=0)
-
     @property
     def requests(self) -> Sequence[tuple[int, ...]]:
-        """For each chunk, bytes of the answer to its first request, and to the others, which are sent together."""
-        return [(size,) for size in self.chunk_bytes().tolist()]
+        """For each chunk, bytes of the answer to its first request, and to the others, which are sent together.
+
+        Without chunks of its own (SPZ) they are as if the file were cut evenly.
+        """
+        if self.scene.chunk_bytes is not None and self.has_chunks:
+            return [(size,) for size in self.scene.chunk_bytes]
+        ends = np.minimum(np.arange(1, self.chunks + 1) * CHUNK_NODES, self.count)
+        return [(size,) for size in np.diff(ends * self.bytes // self.count, prepend=0).tolist()]
 
     @property
     def headers(self) -> tuple[int, ...]:

@@ -268,7 +268,7 @@ class LoadedDetail(LoadedScene):
 
     @property
     def requests(self) -> Sequence[tuple[int, ...]]:
-        return self.files.requests or super().requests
+        return self.files.requests or [(size,) for size in self.files.sizes.tolist()]
 
     @functools.cached_property
     def depth(self) -> NDArray[np.int32]:
@@ -288,9 +288,6 @@ class LoadedDetail(LoadedScene):
     def _file(self) -> NDArray[np.int64]:
         file = np.repeat(self.files.of_run.T.ravel(), self.detail.counts.T.ravel())
         return np.concatenate([file, np.full(self.count - len(file), self.files.environment or 0)])
-
-    def chunk_bytes(self) -> NDArray[np.int64]:
-        return self.files.sizes
 
 
 def read_detail_files(path: Path) -> DetailFiles:

@@ -130,12 +130,14 @@ class Scenes:
         loaded: each scene once.
         of_instance: of each instance, its scene.
         notes: what a person should know of the files.
+        axes: for each instance the name of its file, the axis of the world that is up, and which specification says so.
     """
 
     instances: Sequence[Instance]
     loaded: Sequence[LoadedScene]
     of_instance: Sequence[LoadedScene]
     notes: Sequence[str] = ()
+    axes: Sequence[tuple[str, str | None, str]] = ()
 
     @property
     def title(self) -> str:
@@ -145,15 +147,6 @@ class Scenes:
     def up(self) -> str | None:
         """The axis of the world that points up, one of `scene.AXES`, where it is the same for all files; else None."""
         return common_axis(axis for _, axis, _ in self.axes)
-
-    @functools.cached_property
-    def axes(self) -> list[tuple[str, str | None, str]]:
-        """For each instance the name of its file, the axis of the world that is up, and which specification says so."""
-        axes = list[tuple[str, str | None, str]]()
-        for instance, loaded in zip(self.instances, self.of_instance, strict=True):
-            up = loaded.scene.up and rotated_axis(loaded.scene.up, instance.object_to_world[:3, :3])
-            axes.append((loaded.name, up, loaded.scene.up_by if up == loaded.scene.up else ""))
-        return axes
 
     @functools.cached_property
     def kind(self) -> str | None:
@@ -394,7 +387,11 @@ def read_scenes(
         loaded[key] = entry
         of_instance.append(entry)
         chunks += entry.chunks
-    return Scenes(instances, list(loaded.values()), of_instance, notes)
+    axes = list[tuple[str, str | None, str]]()
+    for instance, entry in zip(instances, of_instance, strict=True):
+        up = entry.scene.up and rotated_axis(entry.scene.up, instance.object_to_world[:3, :3])
+        axes.append((entry.name, up, entry.scene.up_by if up == entry.scene.up else ""))
+    return Scenes(instances, list(loaded.values()), of_instance, notes, axes)
 
 
 def _loaded_runs(

@@ -255,7 +255,7 @@ def test_a_simulated_flight_is_that_of_spark(spark: Spark, capacity: int | None)
     settings = LodSettings(60_000, SPARKS_CONES)
     rng = np.random.default_rng(3)
     counts = set()
-    chunks = scenes.with_cuts[0].chunk_bytes()
+    chunks = [sum(each) for each in scenes.with_cuts[0].requests]
     network = Network(bandwidth=3.0 * float(chunks[0]), latency=0.05)  # three chunks a second
     for frame in Simulation(scenes, settings, StreamingSettings(network, capacity)).run(around(24, 2.0, seconds=4.0)):
         paged.keep(frame.resident, rng)

@@ -27,7 +27,7 @@ def cut_after(loader: Loader, camera: Camera, seconds: float) -> Cut:
 
 def test_the_first_picture_takes_a_header_and_a_chunk(rad_town: Scenes) -> None:
     (tree,) = rad_town.with_cuts
-    header, first = min(65_536, tree.bytes), int(tree.chunk_bytes()[0])
+    header, first = min(65_536, tree.bytes), int(tree.requests[0][0])
     found: Any = Loader(rad_town, CUT, SLOW).load(AT)
     assert found["first_picture_s"] == pytest.approx(0.1 + header / 1e6 + 0.1 + first / 1e6, abs=1e-4)
     assert list(found) == [column.name for column in LOADING]
@@ -38,7 +38,7 @@ def test_the_whole_cut_takes_the_bytes_of_its_chunks(rad_town: Scenes, town: Sce
     for scenes, header in ((town, 0), (rad_town, min(65_536, rad_town.with_cuts[0].bytes))):
         (tree,) = scenes.with_cuts
         found: Any = Loader(scenes, CUT, SLOW).load(AT)
-        assert found["resident_all_bytes"] == header + tree.chunk_bytes().sum()
+        assert found["resident_all_bytes"] == header + sum(map(sum, tree.requests))
         least = found["resident_all_bytes"] / 1e6 + 0.1 * (2 + (header > 0))  # chunk 0 is what the others are known by
         assert found["resident_all_s"] == pytest.approx(least, abs=1e-3)
         assert found["first_picture_s"] < found["resident_90_s"] <= found["resident_all_s"]
