@@ -142,9 +142,9 @@ def test_a_file_is_opened_once(monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
     original = reading.opened
 
-    def counted(file: Path) -> contextlib.AbstractContextManager[Any]:
+    def counted(file: Path, *rest: Any) -> contextlib.AbstractContextManager[Any]:
         read.append(file)
-        return original(file)
+        return original(file, *rest)
 
     monkeypatch.setattr(reading, "opened", counted)
     assert len(read_scenes(five()).with_cuts) == 3

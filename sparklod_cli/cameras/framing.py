@@ -78,13 +78,7 @@ class Balls:
 
 
 def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matrix) -> Balls:
-    """Return what some splats cover where they stand; those without finite numbers are left out.
-
-    Args:
-        splats: all of an object.
-        index: which of them.
-        object_to_world: (4, 4) a rotation, a uniform scale and a translation.
-    """
+    """Return what some splats of an object cover in the world; those without finite numbers are left out."""
     with np.errstate(all="ignore"):
         center = splats.center[index].astype(np.float64) @ object_to_world[:3, :3].T + object_to_world[:3, 3]
         times = float(np.cbrt(np.linalg.det(object_to_world[:3, :3])))

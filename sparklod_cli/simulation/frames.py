@@ -31,12 +31,9 @@ if TYPE_CHECKING:
 
 
 class StreamedCuts(CutFinder):
-    """Cuts of a viewer that fetches the chunks of scenes, for one camera after another.
+    """Cuts of a viewer that fetches the chunks of scenes, for one camera after another; never continuous ones.
 
-    Args:
-        scenes: with trees or detail levels; others are there from the beginning.
-        settings: of the cuts; continuous cuts are not simulated.
-        streaming: network and cache; everything is resident unless given.
+    Scenes without cuts are there from the beginning. Without `streaming` everything is resident.
 
     Raises:
         UnfitError: the budget, or the cache, is too small for the roots; or there are too many instances.

@@ -21,19 +21,15 @@ class Chunks:
         requests: for each scene and chunk, bytes of the answer to its first request, and of the answers to the others,
             which are asked for together.
         headers: for each scene the sizes of the answers that a viewer waits for, one after the other, before it can ask
-            for a chunk; none unless given.
-        rooted: whether scenes are drawn from their first chunks on, which hold their roots; chunk files of Streamed SOG
-            are drawn each for itself.
-        fetchers: default number of chunks that a viewer fetches at a time.
+            for a chunk.
+        rooted: the first chunk of each scene holds its root, and is always wanted; False for Streamed SOG, whose chunk
+            files are drawn each for itself.
         connections: largest number of concurrent requests; None for any number.
 
     Attributes:
         sizes: bytes of each chunk.
         firsts: the first chunk of each scene.
-        roots: the chunks that are always wanted: the first of each scene if `rooted`.
-
-    Raises:
-        ValueError: a scene has no chunks, or a size is negative; or there are not as many headers as scenes.
+        roots: the chunks that are always wanted.
     """
 
     def __init__(

@@ -35,15 +35,9 @@ class ChunkStream:
 
     The state changes at events only, so the result does not depend on the steps in which time advances.
 
-    Args:
-        network: everything arrives at once unless given.
-
     Attributes:
         now: the current time, seconds.
         received: bytes that have arrived since the start, of headers too.
-
-    Raises:
-        ValueError: the capacity is less than the number of trees.
     """
 
     def __init__(

@@ -234,8 +234,7 @@ class DetailFiles:
     Attributes:
         of_run: (R, L) int64 number of the chunk file of each run; -1 where there is no run.
         sizes: (F,) int64 bytes of the chunk files, then of that of the environment where there is one.
-        requests: for each, bytes of the answers to a viewer: of its meta.json, then of each of its images; empty where
-            there are no files.
+        requests: for each, bytes of its meta.json, then of each of its images; empty for a scene in memory.
         environment: number of the chunk file of the environment; None without.
         manifest: bytes of the manifest, which is read before any other file.
     """

@@ -259,10 +259,7 @@ class Scenes:
 class CutFinder:
     """Finds what a viewer draws of scenes; several threads may use it. Without settings it draws full detail.
 
-    Args:
-        remembers: see `Scenes.viewer`.
-
-    `UnfitError` if the budget is too small for the roots, or there are too many instances.
+    `remembers` and errors are those of `Scenes.viewer`.
     """
 
     def __init__(self, scenes: Scenes, settings: LodSettings | None, *, remembers: bool = False) -> None:
@@ -307,12 +304,8 @@ class CutFinder:
         """Return all that some camera may see: whole trees and all levels where cuts are drawn, else full detail."""
         if self.viewer is None:
             return self.scenes.full()
-        return Cut(
-            tuple(
-                Part(loaded, np.arange(loaded.count), None, at.object_to_world)
-                for at, loaded in zip(self.scenes.instances, self.scenes.of_instance, strict=True)
-            )
-        )
+        pairs = zip(self.scenes.instances, self.scenes.of_instance, strict=True)
+        return Cut(tuple(Part(loaded, np.arange(loaded.count), None, at.object_to_world) for at, loaded in pairs))
 
 
 def read_scenes(

@@ -264,7 +264,6 @@ class _Reader:
             raise CameraPathError(f"{self._name} ends before all of its data")
 
     def finish(self, count: int) -> None:
-        """Check that the `count` items that were read are all of the file."""
         if left := len(self._data) - self._at:
             raise CameraPathError(f"{self._name} has {left:,} bytes after the {count:,} items that it announces")
 
