@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..model.lod_tree import LodTree
-from ..model.scene import AXES, SPECIFIED, Scene, facts_of
+from ..model.scene import AXES, SPECIFIED, Scene
 from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
 from ..system.errors import FormatError, HasTreeError, InvalidSplatsError, TreeError, TruncatedError
 from ..system.progress import Progress, silent
@@ -213,7 +213,8 @@ class Reader:
         """Read all splats, once; `validate` refuses a broken tree, and gives leaves a `child_start` of 0."""
         splats, tree = self.read(0, self.count, columns, progress, once=True)
         coding = None if self.coding is None else self.coding()
-        scene = Scene(splats, tree, chunk_bytes=self.chunk_bytes, coding=coding, **facts_of(self))
+        facts = self.antialiased, self.format, self.notes, self.header, self.chunk_bytes, coding, self.up, self.up_by
+        scene = Scene(splats, tree, *facts)
         tree = scene.tree  # which knows that it is valid once it has been validated
         if tree is None or not validate:
             return scene

@@ -278,7 +278,8 @@ def divide(
         some, parent = waiting.pop()
         count = splats[some]
         side = float((box[some, 1].max(axis=0) - box[some, 0].min(axis=0)).max())
-        if len(some) < 2 or _is_small(int(count.sum()), side, settings):
+        total, limit = int(count.sum()), settings.chunk_splats if side <= settings.extent else settings.min_splats
+        if len(some) < 2 or total <= min(limit, settings.chunk_splats):
             number[some] = regions
             own, regions = -1 - regions, regions + 1
         else:
@@ -289,10 +290,6 @@ def divide(
         if parent >= 0:
             children[parent].append(own)
     return number, np.array(children, np.int64).reshape(-1, 2)
-
-
-def _is_small(count: int, side: float, settings: DetailSettings) -> bool:
-    return count <= settings.chunk_splats and (side <= settings.extent or count <= settings.min_splats)
 
 
 def _halves(

@@ -113,7 +113,7 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
         ValueError: the base is out of range.
     """
     n = len(splats)
-    grid = VoxelGrid.of(check(splats), base)
+    grid = plan(check(splats), splats, base)
     with threads_for(n) as threads:
         index, ends = grid.sorted_leaves(splats.center, splats.scale, threads)
         tree = VoxelTree(grid, n, index, ends, splats)
@@ -148,22 +148,6 @@ class VoxelGrid:
     box: NDArray[np.float64]
     largest: float
     space: Space
-
-    @classmethod
-    def of(cls, bounds: Bounds, base: float) -> VoxelGrid:
-        """Return the grid of a scene with these bounds; raise `ValueError` if the base is out of range."""
-        if not MIN_BASE <= base <= MAX_BASE:
-            raise ValueError(f"base {base} is not within {MIN_BASE} to {MAX_BASE}")
-        corners = np.array([bounds.low, bounds.high])
-        farthest = float(np.abs(corners).max())
-        finest = math.floor(math.log(max(bounds.smallest, farthest / MAX_STEPS), base))
-        coarsest = max(finest + 1, math.ceil(math.log(bounds.largest, base)) + 1)
-        steps = base ** np.arange(finest, coarsest + 1, dtype=np.float64)
-        middle = math.sqrt(bounds.smallest) * math.sqrt(bounds.largest)
-        unit = 2.0 ** round(math.log2(max(middle, farthest / FARTHEST, bounds.largest / FARTHEST)))
-        box = (corners / unit).astype(np.float32).astype(np.float64)
-        space = Space(np.zeros(3), np.float64(unit))
-        return cls(base, finest, steps, bounds.low, bounds.high, box, bounds.largest, space)
 
     def parts(self, level: int) -> Parts:
         """Return the parts of the cells of any level; the scene's box bounds all, as a mean is in the box of its terms.
@@ -458,7 +442,18 @@ class VoxelTree:
 
 def plan(bounds: Bounds, sample: Splats, setting: float) -> VoxelGrid:
     """See `StagedBuilder`; the setting is the base."""
-    return VoxelGrid.of(bounds, setting)
+    if not MIN_BASE <= setting <= MAX_BASE:
+        raise ValueError(f"base {setting} is not within {MIN_BASE} to {MAX_BASE}")
+    corners = np.array([bounds.low, bounds.high])
+    farthest = float(np.abs(corners).max())
+    finest = math.floor(math.log(max(bounds.smallest, farthest / MAX_STEPS), setting))
+    coarsest = max(finest + 1, math.ceil(math.log(bounds.largest, setting)) + 1)
+    steps = setting ** np.arange(finest, coarsest + 1, dtype=np.float64)
+    middle = math.sqrt(bounds.smallest) * math.sqrt(bounds.largest)
+    unit = 2.0 ** round(math.log2(max(middle, farthest / FARTHEST, bounds.largest / FARTHEST)))
+    box = (corners / unit).astype(np.float32).astype(np.float64)
+    space = Space(np.zeros(3), np.float64(unit))
+    return VoxelGrid(setting, finest, steps, bounds.low, bounds.high, box, bounds.largest, space)
 
 
 def leaves(splats: Splats, index: NDArray[np.int64], plan: VoxelGrid) -> Pending:

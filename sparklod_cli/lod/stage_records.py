@@ -62,10 +62,6 @@ class Pending:
         """Nodes as they are drawn."""
         return Splats(**{name: self.columns[name] for name in COLUMNS})
 
-    def root(self) -> tuple[Splats, int]:
-        """Return the one node that is left at the end, as it is drawn, and the number of its family."""
-        return self.splats, int(self.columns["family"][0])
-
     @classmethod
     def concat(cls, parts: list[Pending]) -> Pending:
         """Return all parts in order."""

@@ -104,7 +104,7 @@ def run_stages(
     stages = Stages(builder, builder.plan(check(splats), splats.take(slice(None, None, step)), setting))
     left = stages.run(splats, np.arange(len(splats)), EVERYWHERE, splits, is_root=True)
     assert len(left) == 1
-    return *assemble(stages.families, *left.root()), stages
+    return *assemble(stages.families, left.splats, int(left.columns["family"][0])), stages
 
 
 def assemble(families: Sequence[StageFamilies], root: Splats, family: int) -> tuple[Splats, LodTree]:

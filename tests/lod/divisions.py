@@ -73,4 +73,4 @@ def build_divided(
 
     left = run(division, None)
     assert len(left) == 1
-    return *assemble(stages.families, *left.root()), stages
+    return *assemble(stages.families, left.splats, int(left.columns["family"][0])), stages

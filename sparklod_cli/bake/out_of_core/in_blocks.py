@@ -308,7 +308,7 @@ def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> N
         job.store.put(families_of(number), {"rows": rows_of(columns.pop("nodes"), threads), **columns})
         statistics = [Statistics.of(families.nodes, families.family == NO_FAMILY, job.needed)]
         if stage.region is None:
-            root, family = left.root()
+            root, family = left.splats, int(left.columns["family"][0])
             job.store.put(ROOT, {"rows": rows_of(root), "family": np.array([family], np.int64)})
             statistics.append(Statistics.of(root, np.array([family == NO_FAMILY]), job.needed))
         else:
