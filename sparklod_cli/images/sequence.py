@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..cameras.camera import DEFAULT_FPS
-from ..render.renderer import Renderer
+from ..render.renderer import DrawnPicture, Renderer
 from ..render.settings import OF_PIXELS
 from ..system.output import write_file
 from ..system.progress import Progress, silent
@@ -21,7 +22,6 @@ from .pixels import animate
 
 if TYPE_CHECKING:
     from ..cameras.sources import CameraPath
-    from ..render.renderer import DrawnPicture
     from ..render.settings import RenderSettings
     from ..viewers.scenes import CutFinder
     from .output import PictureOutput
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 #: Maximum total number of pixels of the pictures that are cached after finding a gain until their frames are written:
 #: 2 GB of floats.
 CACHED_PIXELS = 1 << 26
+
+#: Pictures and those of the reference that were drawn to find the gain, by camera index.
+Cached = dict[int, tuple[DrawnPicture, DrawnPicture]]
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,7 @@ def write_pictures(
 
     def drawn() -> Iterator[Any]:
         nonlocal empty
-        finished = ordered_map(drawing.finish, range(count), min(settings.jobs, count))
+        finished = ordered_map(finish, range(count), min(settings.jobs, count))
         for done, (fact, is_empty, result) in enumerate(finished, 1):
             progress("drawing", done, count, "frame")
             facts.append(fact)
@@ -108,9 +111,10 @@ def write_pictures(
     with on_threads(settings.threads):
         renderer = Renderer(source, render, path.cameras, progress=progress)
         other = None if reference is None else Renderer(reference, render, path.cameras, progress=progress)
-        drawing = _Drawing(renderer, other, path, output, settings)
-        if other is not None:
-            drawing.gain = settings.gain or drawing.fitting_gain(other, progress)
+        gain, cached = settings.gain or 1.0, Cached()
+        if other is not None and not settings.gain:
+            gain, cached = _fitting_gain(renderer, other, path, settings, progress)
+        finish = functools.partial(_finished, renderer, other, path, output, settings, gain, cached)
         if output.kind == "frames":
             for target, data in zip(output.paths(path.numbers), drawn(), strict=True):
                 size += write_file(target, [data], overwrite=overwrite)
@@ -124,7 +128,7 @@ def write_pictures(
                 captions = [camera.name or f"frame {number}" for number, camera in cameras]
                 data = codes.encode(codes.sheet(list(drawn()), captions), output.form, settings.jpeg_quality)
             size = write_file(output.name or DASH, [data], overwrite=overwrite)
-    return WrittenPictures(facts, size, drawing.gain if other is not None else None, empty)
+    return WrittenPictures(facts, size, gain if other is not None else None, empty)
 
 
 def frame_rate(path: CameraPath) -> float:
@@ -133,72 +137,66 @@ def frame_rate(path: CameraPath) -> float:
     return (len(path.cameras) - 1) / span if span > 0 else DEFAULT_FPS
 
 
-@dataclass
-class _Drawing:
-    """Pictures of `write_pictures`; see there for the first attributes.
+def _finished(
+    renderer: Renderer,
+    reference: Renderer | None,
+    path: CameraPath,
+    output: PictureOutput,
+    settings: PictureSettings,
+    gain: float,
+    cached: Cached,
+    at: int,
+) -> tuple[dict[str, Any], bool, Pixels | bytes]:
+    """Draw the picture of a camera; see `write_pictures`.
 
-    Attributes:
-        gain: factor of differences.
-        cached: by camera index, pictures that were drawn to find the gain.
+    Returns:
+        Facts for the report, whether no splat is in view, and the bytes of its file, or its pixels where several
+        pictures share a file.
     """
+    camera, number = path.cameras[at], path.numbers[at]
+    with on_threads(settings.threads):  # the setting is per Python thread
+        drawn, other = cached.pop(at, (None, None))
+        drawn = drawn or renderer.draw(camera)
+        other = other or (None if reference is None else reference.draw(camera))
+    facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
+    facts |= {"width": camera.width, "height": camera.height}
+    if output.kind == "frames":
+        facts["file"] = str(*output.paths([number]))
+    image = codes.over(drawn.image, settings.background)
+    if other is not None:
+        from .metrics import check_covered, psnr
 
-    renderer: Renderer
-    reference: Renderer | None
-    path: CameraPath
-    output: PictureOutput
-    settings: PictureSettings
-    gain: float = 1.0
-    cached: dict[int, tuple[DrawnPicture, DrawnPicture]] = field(default_factory=dict)
+        check_covered(other.image, f"what --diff names, in frame {number},")
+        expected = codes.over(other.image, settings.background)
+        facts["psnr_db"] = round(psnr(*(np.clip(each[..., :3], 0, 1) for each in (image, expected))), 3)
+        image = codes.difference(image, expected, gain)
+    empty = not drawn.image[..., 3].any()
+    if output.form == "npy":
+        # The values behind the colours if they are per pixel, else the colours.
+        by = renderer.settings.color_by
+        values = drawn.values if by in OF_PIXELS and drawn.values is not None else image
+        return facts, empty, codes.encode_floats(values)
+    pixels = codes.eight_bits(image)
+    bar = renderer.scale if reference is None else codes.difference_bar(gain)
+    if settings.bar and bar is not None:
+        pixels = codes.with_scale(pixels, bar)
+        facts["width"] = pixels.shape[1]
+    alone = output.kind in ("picture", "frames")
+    return facts, empty, codes.encode(pixels, output.form, settings.jpeg_quality) if alone else pixels
 
-    def finish(self, at: int) -> tuple[dict[str, Any], bool, Pixels | bytes]:
-        """Draw the picture of a camera.
 
-        Returns:
-            Facts for the report, whether no splat is in view, and the bytes of its file, or its pixels where several
-            pictures share a file.
-        """
-        output, settings, reference = self.output, self.settings, self.reference
-        camera, number = self.path.cameras[at], self.path.numbers[at]
-        with on_threads(settings.threads):  # the setting is per Python thread
-            drawn, other = self.cached.pop(at, (None, None))
-            drawn = drawn or self.renderer.draw(camera)
-            other = other or (None if reference is None else reference.draw(camera))
-        facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
-        facts |= {"width": camera.width, "height": camera.height}
-        if output.kind == "frames":
-            facts["file"] = str(*output.paths([number]))
-        image = codes.over(drawn.image, settings.background)
-        if other is not None:
-            from .metrics import check_covered, psnr
-
-            check_covered(other.image, f"what --diff names, in frame {number},")
-            expected = codes.over(other.image, settings.background)
-            facts["psnr_db"] = round(psnr(*(np.clip(each[..., :3], 0, 1) for each in (image, expected))), 3)
-            image = codes.difference(image, expected, self.gain)
-        empty = not drawn.image[..., 3].any()
-        if output.form == "npy":
-            # The values behind the colours if they are per pixel, else the colours.
-            by = self.renderer.settings.color_by
-            values = drawn.values if by in OF_PIXELS and drawn.values is not None else image
-            return facts, empty, codes.encode_floats(values)
-        pixels = codes.eight_bits(image)
-        bar = self.renderer.scale if reference is None else codes.difference_bar(self.gain)
-        if settings.bar and bar is not None:
-            pixels = codes.with_scale(pixels, bar)
-            facts["width"] = pixels.shape[1]
-        alone = output.kind in ("picture", "frames")
-        return facts, empty, codes.encode(pixels, output.form, settings.jpeg_quality) if alone else pixels
-
-    def fitting_gain(self, reference: Renderer, progress: Progress) -> float:
-        """Return the gain for all pictures, chosen from the first, the middle and the last one."""
-        cameras, background = self.path.cameras, self.settings.background
-        some = sorted({0, len(cameras) // 2, len(cameras) - 1}, reverse=True)
-        keep = 2 * sum(cameras[at].width * cameras[at].height for at in some) <= CACHED_PIXELS
-        differences = []
-        for done, at in enumerate(some, 1):
-            both = self.renderer.draw(cameras[at]), reference.draw(cameras[at])
-            differences.append(codes.apart(*(codes.over(drawn.image, background) for drawn in both)))
-            if keep:
-                self.cached[at] = both
-            progress("comparing", done, len(some), "frame")
-        return codes.gain_for(differences)
+def _fitting_gain(
+    renderer: Renderer, reference: Renderer, path: CameraPath, settings: PictureSettings, progress: Progress
+) -> tuple[float, Cached]:
+    """Return the gain for all pictures, chosen from the first, the middle and the last one; and these, if small."""
+    cameras, background, cached = path.cameras, settings.background, Cached()
+    some = sorted({0, len(cameras) // 2, len(cameras) - 1}, reverse=True)
+    keep = 2 * sum(cameras[at].width * cameras[at].height for at in some) <= CACHED_PIXELS
+    differences = []
+    for done, at in enumerate(some, 1):
+        both = renderer.draw(cameras[at]), reference.draw(cameras[at])
+        differences.append(codes.apart(*(codes.over(drawn.image, background) for drawn in both)))
+        if keep:
+            cached[at] = both
+        progress("comparing", done, len(some), "frame")
+    return codes.gain_for(differences), cached

@@ -75,7 +75,6 @@ def quantiles_of(values: ArrayLike, weights: ArrayLike | None = None) -> dict[st
 
 
 def _line(text: object) -> str | None:
-    """Return a text of a file in one line; None for anything else."""
     return printable(" ".join(text.split()), MOST) if isinstance(text, str) else None
 
 
@@ -256,7 +255,6 @@ def survey_streamed_sog(
 
 
 def _chunks_of(layout: RegionLayout, chunks: Mapping[str, Chunk], level: int) -> list[Chunk]:
-    """Return the chunk files with splats of a level."""
     held = np.unique(layout.file[layout.level == level]).tolist()
     return [chunks[layout.manifest.filenames[number]] for number in held]
 

@@ -109,12 +109,11 @@ class Libraries:
 
     def import_map(self) -> dict[str, dict[str, str]]:
         imports = {
-            name: self._url(package, path) for name, (package, path) in MODULE_NAMES.items() if package in self.versions
+            name: _url(self.base, package, self.versions[package] if self.integrity else None, path)
+            for name, (package, path) in MODULE_NAMES.items()
+            if package in self.versions
         }
         return {"imports": imports} | ({"integrity": dict(self.integrity)} if self.integrity else {})
-
-    def _url(self, package: str, path: str) -> str:
-        return _url(self.base, package, self.versions[package] if self.integrity else None, path)
 
     def notes(self) -> list[str]:
         return [

@@ -100,11 +100,10 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
         raise UnreadableError(f"{shown.path}: cannot be read: {reason_of(error)}") from None
     leaves = None if scene.tree is None else np.flatnonzero(scene.tree.is_leaf)
     index = slice(None) if leaves is None else leaves
-    balls = balls_of(scene.splats, index, np.eye(4))
     return Extent(
         len(scene.splats),
         None if leaves is None else len(leaves),
-        balls,
+        balls_of(scene.splats, index, np.eye(4)),
         _sizes(scene.splats),
         scene.up,
         layout=_layout(shown, scene.splats),
