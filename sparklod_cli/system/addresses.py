@@ -106,7 +106,9 @@ class Address:
         self, mode: Literal["rb"] = "rb", buffering: int = READ_AHEAD, *, size: int | None = None
     ) -> io.BufferedReader:
         """Open the file for reading; `size` is its size in bytes, if that is known."""
-        return io.BufferedReader(_Ranged(self, self.size() if size is None else size), buffering)
+        from .ranged_file import RangedFile
+
+        return io.BufferedReader(RangedFile(self.read, self.size() if size is None else size), buffering)
 
     def read(self, start: int, stop: int) -> bytes:
         with self._opened() as (system, path):
@@ -167,36 +169,6 @@ class Address:
 
     def _shown(self, error: Exception | str) -> str:
         return without_secrets(str(error), self.url)
-
-
-class _Ranged(io.RawIOBase):
-    """A file at an address, whose bytes are requested when they are read."""
-
-    def __init__(self, address: Address, size: int) -> None:
-        self._address, self._size, self._at = address, size, 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._at
-
-    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
-        self._at = max(0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence])
-        return self._at
-
-    def readinto(self, buffer: Any) -> int:
-        view = memoryview(buffer).cast("B")
-        stop = min(self._at + len(view), self._size)
-        if stop <= self._at:
-            return 0
-        data = self._address.read(self._at, stop)
-        view[: len(data)] = data
-        self._at += len(data)
-        return len(data)
 
 
 #: A file or folder, wherever it is.
