@@ -25,8 +25,7 @@ import sparklod_cli as sparklod
 from sparklod_cli.fitting import pictures as training
 from sparklod_cli.fitting.cuda.card_optimiser import CardOptimiser
 from sparklod_cli.fitting.fit import AHEAD, MOST_SHARE, RATES, raster_for
-from sparklod_cli.fitting.optimiser import Optimiser
-from sparklod_cli.fitting.pictures import TRAINING, FittedNodes, FullDetailPicture, Place, pictures, placed
+from sparklod_cli.fitting.pictures import TRAINING, FittedNodes, FullDetailPicture, Optimiser, Place, pictures, placed
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.render.cuda.card import find_card, to_card
 from sparklod_cli.render.cuda.rasterizer import CardSplats, CardView, draw_on_card

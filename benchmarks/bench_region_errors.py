@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 import sparklod_cli
-from sparklod_cli.bake import region_errors
+from sparklod_cli.bake import parts_output
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.detail_levels import detail_cuts, make, owners_of
@@ -133,8 +133,8 @@ def picture(splats, camera):
 def brightness(scene: DetailScene):
     """(R,) mean square of the pictures of each region at full detail."""
     runs = np.stack([scene.starts, scene.counts], 2)
-    widths = region_errors._widths(scene, runs)
-    return region_errors._differences(scene, runs, 1, silent)[:, 0] / widths**2
+    widths = parts_output._widths(scene, runs)
+    return parts_output._differences(scene, runs, 1, silent)[:, 0] / widths**2
 
 
 def cameras_of(scene: DetailScene):
@@ -165,9 +165,9 @@ def main() -> None:
         scene = make(nodes, tree, DetailSettings(levels=SHARES, chunk_splats=most, extent=1e9, min_splats=1))
         ways = {"tree": tree_errors(nodes, tree, scene)}
         for width in options.widths:
-            region_errors.LEAST_WIDTH, region_errors.MOST_WIDTH = min(width, 64), width
+            parts_output.LEAST_WIDTH, parts_output.MOST_WIDTH = min(width, 64), width
             began = time.process_time()
-            ways[f"pictures-{width}"] = region_errors.measured(scene, threads=1)
+            ways[f"pictures-{width}"] = parts_output.measured(scene, threads=1)
             seconds = time.process_time() - began
             print(f"{path.stem}: pictures of {width}, {seconds:.2f} s of a processor for {len(scene.splats):,} splats")
         best = ways[f"pictures-{options.widths[-1]}"]

@@ -18,7 +18,6 @@ from ..system.progress import Progress, silent
 from ..system.threads import on_threads
 from ..system.units import percent_of
 from .kernels.adam import Rates
-from .optimiser import Optimiser
 from .pictures import (
     HELD_OUT,
     TRAINING,
@@ -26,6 +25,7 @@ from .pictures import (
     FittedSet,
     FullDetailPicture,
     Index,
+    Optimiser,
     Place,
     Scores,
     gain,

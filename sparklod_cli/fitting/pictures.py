@@ -1,4 +1,4 @@
-"""Nodes while they are fitted, cameras, and pictures of full detail: the errors of cuts, and what nodes must keep."""
+"""Nodes while they are fitted, cameras, pictures of full detail, what nodes must keep, and steps of the optimiser."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +21,14 @@ from ..model.gaussian import linear_opacity, lod_opacity, normalized_quat, size_
 from ..model.lod_tree import LodTree
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
-from ..render import rasterizer
+from ..render import gradients, rasterizer
 from ..render.kernels.shade import add_sh
 from ..render.rasterizer import Image, ShadedSplats, draw
 from ..render.settings import RasterSettings
 from ..viewers.cut import Forest, TreeInstance
 from ..viewers.loaded_scene import nodes_of
 from ..viewers.spark import SparkViewer
+from .kernels import adam
 from .kernels.adam import MOST_D, Columns, FitBounds
 from .kernels.view import by_image, mark_seen, squared_differences
 from .settings import SHARES
@@ -401,3 +403,48 @@ def keep_gains(nodes: FittedNodes, held_out: Sequence[FullDetailPicture], before
         nodes.halve(np.intersect1d(np.unique(np.concatenate(drawn)), nodes.fitted))
     nodes.restore(nodes.fitted)
     return before
+
+
+class Optimiser:
+    """Adam for the merged splats of a tree, each with its own count of steps."""
+
+    def __init__(self, nodes: FittedNodes) -> None:
+        self.nodes = nodes
+        self._moved: list[Any] = []
+        count, terms = len(nodes.fitted), nodes.columns.sh.shape[1]
+        self._slots = slots_of(nodes)
+        self._moments = adam.Moments(
+            np.zeros((count, adam.FIRST), np.float32),
+            np.zeros((count, terms, 3), np.float32),
+            np.zeros((count, adam.SECOND), np.float32),
+            np.zeros(count, np.int32),
+        )
+
+    def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
+        nodes, camera = self.nodes, picture.camera
+        seen, shaded = nodes.visible(index, camera)
+        drawing = gradients.draw(shaded, camera, nodes.raster)
+        found = drawing.gradients(picture.gradient(drawing.image))
+        terms = nodes.columns.sh.shape[1]
+        rgb, sh = gradients.by_sh(shaded.center, camera.position, terms, shaded.rgb, found.rgb)
+        derivatives = found.center, found.log_scale, found.turn, found.lod_opacity, rgb, sh
+        columns = adam.Gradients(*map(np.ascontiguousarray, derivatives))
+        rates = adam.Rates(*map(np.float32, rates))
+        adam.step(len(seen), nodes.columns, nodes.old, seen, self._slots, columns, rates, self._moments, nodes.bounds)
+        self._moved.append(seen)
+
+    def place(self) -> None:
+        """Update the nodes that cuts are found with, by the steps since the last call."""
+        for seen in self._moved:
+            self.nodes.renew(seen)
+        self._moved.clear()
+
+    def synchronize(self) -> None:
+        """Update the columns of the nodes, which are always up to date here."""
+
+
+def slots_of(nodes: FittedNodes) -> NDArray[np.int32]:
+    """Return the row of each node in `Moments`, -1 for those that do not change."""
+    slots = np.full(len(nodes.tree), -1, np.int32)
+    slots[nodes.fitted] = np.arange(len(nodes.fitted), dtype=np.int32)
+    return slots

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.bake import region_errors
-from sparklod_cli.bake.region_errors import measured
+from sparklod_cli.bake import parts_output
+from sparklod_cli.bake.parts_output import measured
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.splats import Splats
@@ -85,12 +85,12 @@ def test_an_error_is_that_of_pictures_of_the_rasterizer(
     regions: list[list[Splats]], errors: NDArray[np.float64]
 ) -> None:
     """The slow, obvious way: each region at each level as a scene, seen by cameras."""
-    turns = region_errors._turns()
+    turns = parts_output._turns()
     for region, expected in zip(regions, errors, strict=True):
         low, high = bound(Splats.concat(region))
         middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-        small = np.quantile(region[0].scale.max(axis=1), region_errors.FINE)
-        width = int(np.ceil(np.clip(4 * radius / small, 64, region_errors.MOST_WIDTH) / 16) * 16)
+        small = np.quantile(region[0].scale.max(axis=1), parts_output.FINE)
+        width = int(np.ceil(np.clip(4 * radius / small, 64, parts_output.MOST_WIDTH) / 16) * 16)
         focal = width * 200 / 2.1
         settings = RasterSettings(near=100 * radius, far=400 * radius, sort="z", max_radius=1e6)
         sums = np.zeros(len(region))
@@ -107,13 +107,13 @@ def test_an_error_is_that_of_pictures_of_the_rasterizer(
 
 
 def test_views_are_at_right_angles_and_see_every_harmonic() -> None:
-    turns = region_errors._turns()
+    turns = parts_output._turns()
     np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-6)
     np.testing.assert_allclose(np.linalg.det(turns), 1, atol=1e-6)
     ahead = turns[:, 2]
     np.testing.assert_allclose(ahead.sum(axis=0), 0, atol=1e-6)
     assert np.linalg.matrix_rank(ahead) == 3
-    assert abs(region_errors._basis(turns, 15)).min() > 0.05
+    assert abs(parts_output._basis(turns, 15)).min() > 0.05
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1e-3, (0, 0, 0)), (300.0, (0, 0, 0)), (1.0, (50, -80, 20))])
@@ -132,7 +132,7 @@ def test_other_regions_do_not_matter(regions: list[list[Splats]], errors: NDArra
 def test_threads_and_batches_do_not_matter(
     regions: list[list[Splats]], errors: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(region_errors, "BATCH", 500)
+    monkeypatch.setattr(parts_output, "BATCH", 500)
     steps: list[tuple[int, int]] = []
     found = measured(scene_of(regions), threads=2, progress=lambda name, done, total, unit: steps.append((done, total)))
     assert np.array_equal(found, errors)

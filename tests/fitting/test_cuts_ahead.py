@@ -10,8 +10,7 @@ import pytest
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.fitting import fit as fit_module
 from sparklod_cli.fitting.fit import AHEAD, fit
-from sparklod_cli.fitting.optimiser import Optimiser
-from sparklod_cli.fitting.pictures import FittedNodes, Index
+from sparklod_cli.fitting.pictures import FittedNodes, Index, Optimiser
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod import quality
 from tests.scenes import random_splats

@@ -10,8 +10,7 @@ import pytest
 from sparklod_cli.fitting import fit as fit_module
 from sparklod_cli.fitting.fit import fit
 from sparklod_cli.fitting.kernels.adam import Rates
-from sparklod_cli.fitting.optimiser import Optimiser
-from sparklod_cli.fitting.pictures import FittedNodes, FullDetailPicture, Index
+from sparklod_cli.fitting.pictures import FittedNodes, FullDetailPicture, Index, Optimiser
 from sparklod_cli.fitting.settings import FitSettings, Refined
 from sparklod_cli.lod import quality
 from sparklod_cli.model.splats import COLUMNS, Splats

@@ -7,8 +7,7 @@ import pytest
 
 from sparklod_cli.fitting.fit import LAST, RATES, STAGES, Schedule, default_steps
 from sparklod_cli.fitting.kernels.adam import MOST_D, Rates
-from sparklod_cli.fitting.optimiser import Optimiser
-from sparklod_cli.fitting.pictures import FittedNodes, FullDetailPicture, Place, pictures, placed
+from sparklod_cli.fitting.pictures import FittedNodes, FullDetailPicture, Optimiser, Place, pictures, placed
 from sparklod_cli.lod import quality
 from sparklod_cli.render.rasterizer import draw
 from sparklod_cli.render.settings import RasterSettings

@@ -11,8 +11,7 @@ from ...render.cuda.backward import gradients_on_card
 from ...render.cuda.card import CardArray, card_errors, on_card, to_card
 from ...render.cuda.rasterizer import CardPicture, CardSplats, CardView, draw_on_card
 from ..kernels import adam
-from ..optimiser import Optimiser, slots_of
-from ..pictures import LEAST_ERROR, FittedNodes, FullDetailPicture, Index
+from ..pictures import LEAST_ERROR, FittedNodes, FullDetailPicture, Index, Optimiser, slots_of
 from . import kernels
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.fitting.fit import RATES, fit
-from sparklod_cli.fitting.optimiser import Optimiser
-from sparklod_cli.fitting.pictures import FittedNodes, FittedSet, Place, pictures, placed
+from sparklod_cli.fitting.pictures import FittedNodes, FittedSet, Optimiser, Place, pictures, placed
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod import quality
 from sparklod_cli.render.settings import RasterSettings
