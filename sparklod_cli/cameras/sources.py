@@ -109,7 +109,6 @@ def cameras_of(
         axes: of frames without their own, unless settings have some.
         count: number of frames, rounded up and at least one, where a function computes them.
         fps: frames a second of the file; None if it gives none.
-        notes: what was ignored or assumed.
 
     Raises:
         CameraPathError: there are no cameras, or one makes no sense, which the text names; its subclass

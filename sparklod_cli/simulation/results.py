@@ -293,14 +293,10 @@ def add_extremes(most: Extremes, row: Row, *, is_first: bool) -> list[str]:
 def moments_of(most: Extremes) -> list[Moment]:
     """Return the frame of each criterion that any frame meets, in the order of `MOMENTS`."""
     moments = []
-    for criterion in filter(most.__contains__, MOMENTS):
-        value, row = most[criterion]
-        frame, name, time = (
-            cast("int", row["frame"]),
-            cast("str | None", row["name"]),
-            cast("float | None", row["time_s"]),
-        )
-        moments.append(Moment(criterion, frame, time, name or None, _rounded(value), MOMENTS[criterion][2]))
+    for criterion, (value, row) in sorted(most.items(), key=lambda item: [*MOMENTS].index(item[0])):
+        frame, time = cast("int", row["frame"]), cast("float | None", row["time_s"])
+        name = cast("str | None", row["name"]) or None
+        moments.append(Moment(criterion, frame, time, name, _rounded(value), MOMENTS[criterion][2]))
     return moments
 
 

@@ -143,13 +143,6 @@ class Pages:
                 assert tree is not None
                 yield splats, tree
 
-    def leaf_count(self) -> int:
-        return sum(int(np.count_nonzero(tree.is_leaf)) for _, tree in self.blocks(()))
-
-    def leaves(self) -> NDArray[np.int64]:
-        found = [np.flatnonzero(tree.is_leaf) for _, tree in self.blocks(())]
-        return np.concatenate([number * CHUNK_NODES + leaves for number, leaves in enumerate(found)])
-
     def _decoded(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
         with naming(self._name):
             return self.file.chunk(number, columns)
@@ -179,11 +172,12 @@ class PagedScene(LoadedScene):
     @functools.cached_property
     def leaves(self) -> Index:
         """(M,) indices of full detail, for which the children of all nodes are read."""
-        return self.pages.leaves()
+        found = [np.flatnonzero(tree.is_leaf) for _, tree in self.pages.blocks(())]
+        return np.concatenate([number * CHUNK_NODES + leaves for number, leaves in enumerate(found)])
 
     @functools.cached_property
     def leaf_count(self) -> int:
-        return self.pages.leaf_count()
+        return sum(int(np.count_nonzero(tree.is_leaf)) for _, tree in self.pages.blocks(()))
 
     def rows(self, index: Index) -> Splats:
         return self.pages.splats(index)

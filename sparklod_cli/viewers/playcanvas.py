@@ -148,9 +148,7 @@ def _keys(instance: Distant, rule: DetailRule) -> Levels:
 def _threshold(instances: Sequence[Distant], keys: Sequence[Levels], room: int, bins: int) -> int:
     """Return the least key of a step that is taken: the highest at which the budget suffices, to a part.
 
-    Args:
-        room: splats by which all regions together may exceed their coarsest levels.
-        bins: highest bin of the threshold.
+    All regions together may exceed their coarsest levels by `room` splats; `bins` is the highest bin.
     """
     key = np.concatenate([each.ravel() for each in keys])
     saved = np.concatenate([-np.diff(each.chains.count, axis=1).ravel() for each in instances])
@@ -413,9 +411,8 @@ def loading(
 
     Args:
         chosen: (R,) levels, -1 for a region without splats.
-        resident: (F,) files.
         before: (R,) levels that were drawn before, -1 for none; None for none at all.
-        underfill: levels by which a region may be coarser while a file is missing; see `DetailRule`.
+        underfill: see `DetailRule`.
 
     Returns:
         (R,) the drawn level of each region, -1 for none; and (F,) priorities, above 0 for files that are in use or
