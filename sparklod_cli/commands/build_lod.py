@@ -12,7 +12,6 @@ import click
 
 from ..codecs.formats import FORMATS, MANIFEST, NPZ, RAW_SUFFIXES, TILESET, WRITABLE, ending_of
 from ..codecs.formats import RAD_SUFFIX as RAD
-from ..lod.builders import BUILDERS
 from ..system import interrupts
 from ..system.addresses import Address, Place
 from ..system.errors import SparklodError
@@ -224,10 +223,6 @@ def _check(ctx: click.Context, options: BuildLodOptions) -> list[Instance]:
         refuse(ctx, ["scratch_dir", "resume"], "cannot be used with --refine, which needs the whole tree in memory")
     if options.unlod:
         refuse(ctx, (*OF_SCRATCH, *OF_CLUSTERS, "refine", "skip_existing"), "cannot be used with --unlod")
-    else:
-        for method, builder in BUILDERS.items():
-            if method != options.builder:
-                refuse(ctx, [builder.setting], f"is an option of --method {method}, not of {options.builder}")
     if DASH in inputs:
         refuse(
             ctx, OF_CLUSTERS, "cannot be used with standard input, which workers cannot read; save it to a file first"

@@ -66,6 +66,9 @@ NO_THUMBNAIL = (
     *("sheet", "fps", "every"),
 )
 
+#: Heading of options of comparisons: of cuts with full detail (`--compare`), and of one file with another (`--diff`).
+COMPARISON = "Comparison"
+
 #: Colours whose scale spans the numbers that cameras see, rather than all numbers of the scenes.
 COLORS_OF_CUTS = ("level", "chunk", "overdraw")
 
@@ -179,56 +182,6 @@ class Appearance:
         return dataclasses.replace(self.render, device=device, options=known)
 
 
-@dataclass(frozen=True)
-class ComparisonOptions:
-    """Options of comparisons: of cuts with full detail (`--compare`), and of one file with another (`--diff`)."""
-
-    HEADING: ClassVar[str] = "Comparison"
-
-    compare: bool = flag(
-        "Measure how far the cuts of each --budget are from full detail, as a table instead of pictures.",
-        excludes=NOT_COMPARED,
-    )
-    asserts: tuple[str, ...] = setting(
-        "With --compare: a condition that must hold, such as 'psnr_min>30', or '5%:psnr>30' for one of the budgets; the"
-        " exit status is 3 if it does not.",
-        **ASSERT,
-        needs="compare",
-    )
-    plot: Path | None = setting("With --compare: draw charts of the table as a .png.", PNG, needs="compare")
-    max_sh: int = setting(
-        "With --compare: highest degree of spherical harmonics to draw.",
-        whole(0, MAX_SH_DEGREE),
-        MAX_SH_DEGREE,
-        needs="compare",
-    )
-    diff: Path | None = setting(
-        "Draw the difference from the picture of another file, and print its PSNR.", NamedPath()
-    )
-    gain: float | None = setting(
-        "Factor by which --diff multiplies differences.  [default: chosen for the pictures]",
-        Range(above=0),
-        needs="diff",
-    )
-
-    def assertions(self, budgets: Sequence[Budget]) -> list[tuple[int | None, Assertion]]:
-        """Return the assertions, each with the index of the budget before its colon; None for all budgets."""
-        from ..api.comparison import COLUMNS
-        from ..tables import assertions
-
-        parsed: list[tuple[int | None, Assertion]] = []
-        texts = [budget.text for budget in budgets]
-        for text in self.asserts:
-            name, colon, rest = text.rpartition(":")
-            name = name.strip()
-            if colon and name not in texts:
-                raise click.UsageError(f"--assert {text!r}: {name} is not one of the budgets, {', '.join(texts)}")
-            with assert_errors():
-                assertion = dataclasses.replace(assertions.parse(rest, COLUMNS), text=text.strip())
-            parsed.append((texts.index(name) if colon else None, assertion))
-        return parsed
-
-
 EXAMPLES = """\
   sparklod render scene-lod.spz --budget 500k --size 1280x720 -o preview.png
   sparklod render scene.ply --thumbnail
@@ -247,7 +200,7 @@ EXAMPLES = """\
     --budget 5%,25% --assert '25%:psnr>30'                  # exit status 3
 """
 
-HEADINGS = (*(COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming"), *("Appearance", "Comparison", "Output"))
+HEADINGS = (*(COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming"), *("Appearance", COMPARISON, "Output"))
 
 
 @dataclass(frozen=True)
@@ -291,9 +244,56 @@ class RenderOptions:
     )
     streaming: StreamingSettings = field(default_factory=StreamingSettings)
     appearance: Appearance = field(default_factory=Appearance)
-    comparison: ComparisonOptions = field(default_factory=ComparisonOptions)
+    compare: bool = flag(
+        "Measure how far the cuts of each --budget are from full detail, as a table instead of pictures.",
+        heading=COMPARISON,
+        excludes=NOT_COMPARED,
+    )
+    asserts: tuple[str, ...] = setting(
+        "With --compare: a condition that must hold, such as 'psnr_min>30', or '5%:psnr>30' for one of the budgets; the"
+        " exit status is 3 if it does not.",
+        **ASSERT,
+        heading=COMPARISON,
+        needs="compare",
+    )
+    plot: Path | None = setting(
+        "With --compare: draw charts of the table as a .png.", PNG, heading=COMPARISON, needs="compare"
+    )
+    max_sh: int = setting(
+        "With --compare: highest degree of spherical harmonics to draw.",
+        whole(0, MAX_SH_DEGREE),
+        MAX_SH_DEGREE,
+        heading=COMPARISON,
+        needs="compare",
+    )
+    diff: Path | None = setting(
+        "Draw the difference from the picture of another file, and print its PSNR.", NamedPath(), heading=COMPARISON
+    )
+    gain: float | None = setting(
+        "Factor by which --diff multiplies differences.  [default: chosen for the pictures]",
+        Range(above=0),
+        heading=COMPARISON,
+        needs="diff",
+    )
     as_json: bool = flag("Print what was drawn as one JSON object on standard output.", **JSON)
     general: General = field(default_factory=General)
+
+    def assertions(self, budgets: Sequence[Budget]) -> list[tuple[int | None, Assertion]]:
+        """Return the assertions, each with the index of the budget before its colon; None for all budgets."""
+        from ..api.comparison import COLUMNS
+        from ..tables import assertions
+
+        parsed: list[tuple[int | None, Assertion]] = []
+        texts = [budget.text for budget in budgets]
+        for text in self.asserts:
+            name, colon, rest = text.rpartition(":")
+            name = name.strip()
+            if colon and name not in texts:
+                raise click.UsageError(f"--assert {text!r}: {name} is not one of the budgets, {', '.join(texts)}")
+            with assert_errors():
+                assertion = dataclasses.replace(assertions.parse(rest, COLUMNS), text=text.strip())
+            parsed.append((texts.index(name) if colon else None, assertion))
+        return parsed
 
 
 @click.command("render", cls=Command, options=RenderOptions, examples=EXAMPLES, headings=HEADINGS)
@@ -315,18 +315,18 @@ def render(ctx: click.Context, /, **_: Any) -> None:
     check_declared(ctx)
     options = values_of(ctx, RenderOptions)
     look = options.appearance
-    if options.comparison.diff is not None:
+    if options.diff is not None:
         refuse(ctx, ["color_by"], "cannot be used with --diff, which compares the splats' own colours")
         if look.alpha or look.background is None:
             raise click.UsageError("--diff compares pictures without alpha; name a --background such as black")
-    elif not options.comparison.compare and look.render.color_by is None:
+    elif not options.compare and look.render.color_by is None:
         refuse(ctx, ["no_bar"], "can only be used with --color-by or --diff")
     options.cameras.check(ctx)
     if options.after is None:
         refuse(ctx, LOADING, "can only be used with --after")
     look.check(ctx)
     claim_stdout(ctx, "output", as_json=options.as_json)
-    if options.comparison.compare:
+    if options.compare:
         ctx.exit(_compare(ctx, options))
     if options.thumbnail:
         small = dataclasses.replace(options.cameras, size=THUMBNAIL_SIZE)
@@ -365,7 +365,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
         # What looks at more than cuts is read whole.
         paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
         scenes = scenes_of_files(instances, **reads, through=look.through, paged=paged)
-        path, diff = options.cameras.path(scenes), options.comparison.diff
+        path, diff = options.cameras.path(scenes), options.diff
         render = with_planes(ctx, options.cameras, render, path, scenes)
         output, settings = _place(ctx, options, instances, path)
         check_view(ctx, console, options.cameras, path, scenes(), options.streaming.network, scenes().notes)
@@ -439,12 +439,12 @@ def _place(
     settings = PictureSettings(
         background=background,
         bar=not look.no_bar,
-        gain=options.comparison.gain,
+        gain=options.gain,
         jpeg_quality=options.jpeg_quality,
         jobs=options.jobs,
         threads=options.general.threads,
     )
-    bar = (look.render.color_by is not None or options.comparison.diff is not None) and settings.bar
+    bar = (look.render.color_by is not None or options.diff is not None) and settings.bar
     supersample, most = look.render.supersample, MOST_SIDE.get(output.form)
     for camera in path.cameras:
         height, width = camera.height, camera.width + (scale_width(camera.width, camera.height) if bar else 0)
@@ -507,7 +507,7 @@ def _report(
 def _compare(ctx: click.Context, options: RenderOptions) -> int:
     """Compare, write the table and the charts, and print the summary; return the exit status."""
     budgets = options.cut.budget or parse_budgets(DEFAULT_BUDGETS)
-    asserts = options.comparison.assertions(budgets)
+    asserts = options.assertions(budgets)
     output, general, overwrite = options.output, options.general, options.overwrite
     assert not isinstance(output, Folder)  # see `name_outputs`
     from ..api.comparison import COLUMNS, check_chart, compare_files
@@ -527,9 +527,9 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
             return for_screen(pieces) if is_terminal(sys.stdout) and table.form != "parquet" else pieces
 
         table.check()
-        if options.comparison.plot is not None:
-            check_chart(options.comparison.plot, overwrite=overwrite)
-        render = dataclasses.replace(options.appearance.settings(console.say), max_sh=options.comparison.max_sh)
+        if options.plot is not None:
+            check_chart(options.plot, overwrite=overwrite)
+        render = dataclasses.replace(options.appearance.settings(console.say), max_sh=options.max_sh)
         scenes = scenes_of_files(
             instances,
             precision=options.cut.precision,
@@ -551,7 +551,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
             render,
             table,
             asserts=asserts,
-            plot=options.comparison.plot,
+            plot=options.plot,
             overwrite=overwrite,
             passed=passed,
             threads=general.threads,

@@ -369,11 +369,6 @@ class BuildLodOptions:
         refines_rad = self.refine is not None and {each.suffix.lower() for each in self.inputs} == {RAD}
         return OutputForm(NPZ if self.encoding else ending_of(self.name) or (RAD if refines_rad else SPZ))
 
-    @property
-    def builder(self) -> str:
-        """Name of the tree builder."""
-        return self.method or (METHOD_OF_DETAIL if self.output_form.cuts else METHOD)
-
     def target(self, source: Place) -> Place:
         """Return the output for an input."""
         if self.output is not None:
@@ -401,9 +396,13 @@ class BuildLodOptions:
 
             refine = FitSettings(self.refine or None, self.seed, device=self.device)
         form = self.output_form
+        method = self.method or (METHOD_OF_DETAIL if form.cuts else METHOD)
+        for other, builder in BUILDERS.items():
+            if other != method:
+                refuse(ctx, [builder.setting], f"is an option of --method {other}, not of {method}")
         growth = DETAIL_GROWTH if form.cuts else DEFAULT_GROWTH
         return BakeSettings(
-            method=self.builder,
+            method=method,
             base=self.base,
             growth=growth if self.growth is None else self.growth,
             max_sh=self.max_sh,
