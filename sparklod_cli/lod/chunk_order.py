@@ -155,7 +155,6 @@ def _families(
     order: NDArray[np.uint32],
     threads: int,
 ) -> Families:
-    """Return the families in an order."""
     above, center = parent[order], center[order]
     parent = np.where(above < 0, np.int32(-1), _places(order)[above])
     records = np.zeros(len(order), NODE)
@@ -173,7 +172,6 @@ def _families(
 
 
 def _places(order: NDArray[np.uint32]) -> Index:
-    """Return the (F,) place of each family in an order."""
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     return place

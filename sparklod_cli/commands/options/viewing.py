@@ -348,7 +348,7 @@ class CutOptions:
 
 def files_read(cameras: Cameras, instances: list[Instance]) -> dict[str, list[Path]]:
     """For `keep_apart`: by the name of an option, the files that it names without being one."""
-    splats = [instance.file for instance in instances if instance.file is not None]
+    splats = [each.source for each in instances if isinstance(each.source, Path)]
     matrix = cameras.world_transform and file_of(cameras.world_transform)
     return {"scene": splats, "world_transform": [matrix] if matrix else []}
 
