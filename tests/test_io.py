@@ -10,7 +10,8 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.io import local_files, read_scene
+from sparklod_cli.io import local_files
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.system.errors import FormatError, UnreadableError
 from tests.conftest import FIXTURES, IS_ROOT
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from sparklod_cli.bake.identity import files_of
-from sparklod_cli.io import companions, parts_output, read_parts, read_scene
-from sparklod_cli.io.local_files import leads_away
-from sparklod_cli.io.writing import siblings_of
+from sparklod_cli.io.local_files import companions, leads_away
+from sparklod_cli.io.reading import read_parts, read_scene
+from sparklod_cli.io.writing import parts_output, siblings_of
 from sparklod_cli.system import output as outputs
 from sparklod_cli.system.addresses import Address
 from sparklod_cli.system.errors import OutputError

@@ -12,7 +12,8 @@ import pytest
 from sparklod_cli.codecs import formats
 from sparklod_cli.codecs.rad import rad_header
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader
-from sparklod_cli.io import companions, siblings_of
+from sparklod_cli.io.local_files import companions
+from sparklod_cli.io.writing import siblings_of
 from sparklod_cli.system.errors import OutputError
 from sparklod_cli.system.output import Output
 from tests.conftest import IS_ROOT

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.io import parts_output
+from sparklod_cli.io.writing import parts_output
 from sparklod_cli.system import output as outputs
 from sparklod_cli.system.addresses import Address
 from sparklod_cli.system.errors import FormatError, OutputError

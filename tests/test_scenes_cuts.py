@@ -13,7 +13,7 @@ from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.gpu import ext_splats, packed_splats
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.images.metrics import psnr
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.gaussian import moved
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import Scene

@@ -8,7 +8,7 @@ from pathlib import Path
 from sparklod_cli.codecs.formats import TILESET
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.tiles_3d.codec import encode_files
-from sparklod_cli.io import parts_output
+from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import quality, tiles
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.model.splats import Splats

@@ -15,7 +15,7 @@ from sparklod_cli.cameras.camera import Settings
 from sparklod_cli.cameras.camera_files import LARGEST, read
 from sparklod_cli.cameras.formats.parsing import Files
 from sparklod_cli.cameras.formats.table import FORMATS, NAMES
-from sparklod_cli.io import read_together
+from sparklod_cli.io.local_files import read_together
 
 from ..case import Case, LawError, Rng
 from ..command import command

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 
 from .. import laws
 from ..case import Case, Rng

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..io import rad_file, read_scene
+from ..io import rad_file
+from ..io.reading import read_scene
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ..inspection import expectations, leaves
 from ..inspection.findings import Finding
 from ..inspection.report import Report, ReportSettings, inspect
-from ..io import read_scene
+from ..io.reading import read_scene
 from ..model.scene import Scene
 from ..system.errors import FormatError, SparklodError, naming
 from ..system.output import check_writable

@@ -9,7 +9,7 @@ from types import NoneType
 from typing import TYPE_CHECKING
 
 from ..codecs.formats import DEFAULT_COMPRESSION, MANIFEST
-from ..io import parts_output, scene_output, write_scene
+from ..io.writing import parts_output, scene_output, write_scene
 from ..model.scene import Scene
 from ..system.errors import FormatError, InvalidSplatsError, memory_errors_translated, naming
 from ..system.output import Output

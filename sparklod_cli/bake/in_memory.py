@@ -10,8 +10,8 @@ import numpy as np
 
 from ..codecs.reader import check_valid, is_valid_and_visible
 from ..codecs.statistics import Statistics
-from ..io import read_rgba, read_scene
-from ..io.reading import Source
+from ..io.local_files import read_rgba
+from ..io.reading import Source, read_scene
 from ..lod.builders import BUILDERS
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene, rotated_axis

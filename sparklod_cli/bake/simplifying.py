@@ -19,7 +19,7 @@ from ..codecs.options import WriteOptions
 from ..codecs.reader import check_valid
 from ..codecs.spz import like
 from ..fitting.settings import FitSettings, Refined
-from ..io import read_scene
+from ..io.reading import read_scene
 from ..io.writing import encoded, scene_output, write_scene
 from ..model.falloff import MIN_ALPHA
 from ..model.scene import Scene

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import io
+from ..io.local_files import read_text, read_together
 from ..system.errors import CameraPathError, SparklodError
 from ..system.untrusted import Origin, parse_json
 from .camera import Matrix, Settings, rigid
@@ -66,7 +66,7 @@ def read_path(path: Path, format: str | None = None, settings: Settings | None =
     A `CameraPathError`, also where it cannot be read, names the file.
     """
     try:
-        contents = io.read_together(path, NAMES, LARGEST)
+        contents = read_together(path, NAMES, LARGEST)
     except SparklodError as error:
         raise CameraPathError(str(error)) from None
     try:
@@ -102,7 +102,7 @@ def similarity(text: str) -> Matrix:
 def read_world_transform(path: Path) -> Matrix:
     """Return the `similarity` in a file; a `CameraPathError` names the file."""
     try:
-        return similarity(io.read_text(path))
+        return similarity(read_text(path))
     except CameraPathError as error:
         raise CameraPathError(f"{path}: --world-transform {error}") from None
     except SparklodError as error:

@@ -165,7 +165,7 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
 
 def with_chunks(headers: Iterable[Place]) -> list[Place]:
     """Return outputs of several files, and the files beside them that are replaced or removed with them."""
-    from ..io import siblings_of
+    from ..io.writing import siblings_of
 
     files = list[Place]()
     for header in headers:

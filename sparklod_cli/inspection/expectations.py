@@ -9,7 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ..io import read_text
+from ..io.local_files import read_text
 from ..system.errors import SparklodError
 from ..system.untrusted import QUOTED, near, printable, quoted
 from ..tables.assertions import Assertion, BadAssertionError, is_number, number_text, parse_assertion

@@ -16,8 +16,9 @@ from ..codecs.gpu.dump import Arrays
 from ..codecs.reader import code_of
 from ..codecs.spark_codings import SplatEncoding
 from ..codecs.spz import KNOWN_FLAGS
-from ..io import opened, read_arrays, read_scene, size_of_input
+from ..io.local_files import size_of_input
 from ..io.rad_file import RadFile
+from ..io.reading import opened, read_arrays, read_scene
 from ..model.scene import Scene
 from ..model.sh import width_of
 from ..model.splats import COLUMNS, Splats

@@ -27,8 +27,7 @@ from ..cameras.camera_files import read
 from ..cameras.formats.parsing import Files
 from ..cameras.formats.table import NAMES
 from ..cameras.sources import CameraPath
-from ..io import read_text
-from ..io.local_files import leads_away, open_plain
+from ..io.local_files import leads_away, open_plain, read_text
 from ..model.scene import up_notes_of
 from ..system.errors import CameraPathError, OutputError, SparklodError, reason_of
 from ..system.output import try_place, write_file

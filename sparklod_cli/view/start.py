@@ -18,8 +18,8 @@ from ..cameras.sources import single_views, whole_scene
 from ..codecs.losses import MOST_PAGED_DEGREE, sample_loss
 from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
-from ..io import read_parts, read_scene
 from ..io.local_files import open_plain
+from ..io.reading import read_parts, read_scene
 from ..model.splats import Splats
 from ..model.traversed import DetailScene, TileScene
 from ..system.errors import InvalidSplatsError, UnreadableError, naming, reason_of

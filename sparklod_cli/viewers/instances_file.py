@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..cameras.camera import rotation_of
-from ..io import is_file_name, read_text
+from ..io.local_files import is_file_name, read_text
 from ..model.foveation import Cones, Foveation, Frustum
 from ..model.instances import TOTAL, Instance, Matrix, names_of
 from ..model.transforms import LARGEST, scale_of

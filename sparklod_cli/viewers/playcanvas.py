@@ -20,7 +20,7 @@ from ..cameras.camera import Camera
 from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.streamed_sog.codec import layout_of
 from ..codecs.streamed_sog.manifest import MAX_MANIFEST, files_of_chunk, parse
-from ..io import opened
+from ..io.reading import opened
 from ..model.traversed import DetailScene
 from ..system.errors import FormatError
 from .cut import Forest, TreeCut, TreeInstance

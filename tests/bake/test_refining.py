@@ -15,7 +15,7 @@ from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.fitting.settings import FitSettings
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
 from sparklod_cli.system.errors import CameraPathError, FormatError, InvalidSplatsError, OutOfMemoryError, OutputError

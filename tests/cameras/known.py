@@ -14,7 +14,7 @@ from sparklod_cli.cameras.camera_files import read
 from sparklod_cli.cameras.formats.parsing import Files
 from sparklod_cli.cameras.formats.table import NAMES
 from sparklod_cli.cameras.sources import CameraPath
-from sparklod_cli.io import read_together
+from sparklod_cli.io.local_files import read_together
 from tests.conftest import FIXTURES
 
 FOLDER = FIXTURES / "cameras"

@@ -15,7 +15,7 @@ from plyfile import PlyData, PlyElement
 from fixtures import by_hand_compressed_ply
 from sparklod_cli.codecs import compressed_ply
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import FormatError

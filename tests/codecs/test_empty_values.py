@@ -12,7 +12,7 @@ import pytest
 
 from fixtures import by_hand_sog
 from sparklod_cli.cli import run
-from sparklod_cli.io import read_parts, read_scene
+from sparklod_cli.io.reading import read_parts, read_scene
 from tests.conftest import FIXTURES, Capture
 
 GOLDEN = FIXTURES / "golden"

@@ -19,7 +19,7 @@ from sparklod_cli.codecs.glb import codec as glb
 from sparklod_cli.codecs.glb.glb_container import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import AXES, Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.transforms import Transform

@@ -18,7 +18,8 @@ from sparklod_cli.codecs.glb.attributes import READ_AS_LOGS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.reader import OpenFile, decode_file
 from sparklod_cli.inspection.report import ReportSettings, inspect
-from sparklod_cli.io import companions, open_reader, read_scene
+from sparklod_cli.io.local_files import companions
+from sparklod_cli.io.reading import open_reader, read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform

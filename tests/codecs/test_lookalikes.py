@@ -14,7 +14,8 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import HEAD, JSON_HEAD, head_of, sniff
-from sparklod_cli.io import read_scene, read_text
+from sparklod_cli.io.local_files import read_text
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.system.errors import FormatError, SparklodError
 from tests.conftest import FIXTURES, Capture
 

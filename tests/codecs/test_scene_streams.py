@@ -14,8 +14,7 @@ import pytest
 from sparklod_cli.codecs.merging import Placed, merged
 from sparklod_cli.codecs.reader import Reader
 from sparklod_cli.codecs.sog.sog_container import SogFiles
-from sparklod_cli.io import Merged, open_reader, read_scene
-from sparklod_cli.io.reading import MOST
+from sparklod_cli.io.reading import MOST, Merged, open_reader, read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform

@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.codecs import splat
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats

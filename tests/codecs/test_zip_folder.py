@@ -13,8 +13,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.streamed_sog.manifest import parse
 from sparklod_cli.codecs.zip_folder import ZipFolder
-from sparklod_cli.io import read_parts, read_scene
-from sparklod_cli.io.reading import open_reader
+from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import FormatError, NotSplatsError

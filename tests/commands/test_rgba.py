@@ -14,7 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
-from sparklod_cli.io import read_rgba, read_scene
+from sparklod_cli.io.local_files import read_rgba
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.system.errors import FormatError
 from tests.conftest import FIXTURES, Capture
 

@@ -12,7 +12,7 @@ import sparklod_cli as sparklod
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.formats import WRITABLE
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import SparklodError
 from tests.conftest import FIXTURES, Capture

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import Image
 
 import sparklod_cli
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, ROOT

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from sparklod_cli import io
 from sparklod_cli.cameras import camera
 from sparklod_cli.codecs import compression
 from sparklod_cli.inspection import tree
+from sparklod_cli.io import local_files as io
 from sparklod_cli.system import untrusted
 from tests.conftest import ROOT
 

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from sparklod_cli.codecs.rad import rad_header
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from tests.conftest import FIXTURES, ROOT
 
 DEMO = FIXTURES / "demo.ply"

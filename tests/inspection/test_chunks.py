@@ -20,8 +20,8 @@ from sparklod_cli.inspection.blocks import ReportBlocks, merged
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.inspection.tree import TreeColumns
 from sparklod_cli.inspection.values import LEVELS, Numbers
-from sparklod_cli.io import read_scene
 from sparklod_cli.io.rad_file import RadFile
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, Capture, real_scene

@@ -19,7 +19,7 @@ from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.inspection import leaves
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.leaves import check
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene

@@ -19,7 +19,7 @@ from sparklod_cli.inspection import headers, leaves
 from sparklod_cli.inspection.headers import PropertyFacts
 from sparklod_cli.inspection.html import FileSection, page
 from sparklod_cli.inspection.report import ReportSettings, inspect
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, Capture, real_scene
 from tests.inspection.rad_files import CHUNK, RANGES, Rad, tree, with_chunk, with_fields

@@ -20,7 +20,8 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.manifest import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io import parts_output, read_parts
+from sparklod_cli.io.reading import read_parts
+from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import detail_levels, quick
 from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.system.errors import FormatError

@@ -13,7 +13,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.streamed_sog.manifest import MAX_MANIFEST
 from sparklod_cli.inspection import html
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io import read_parts, read_scene
+from sparklod_cli.io.reading import read_parts, read_scene
 from tests.conftest import Capture
 from tests.inspection.streamed_sog_files import COUNTS, Folder, Node, folder, regions
 

@@ -18,7 +18,7 @@ from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.tiles_3d import codec, tileset_rules
 from sparklod_cli.codecs.tiles_3d.tileset_rules import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io import parts_output
+from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.tiles import make

@@ -27,7 +27,7 @@ from sparklod_cli.inspection.values import (
     names_of,
     quantity,
 )
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS

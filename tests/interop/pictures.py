@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import draw, shade

@@ -21,7 +21,7 @@ from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.scene import Scene

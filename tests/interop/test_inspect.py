@@ -21,7 +21,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, real_scene
 from tests.interop.laws import degrees_between

@@ -15,7 +15,7 @@ from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.rad_options import HALF
 from sparklod_cli.codecs.spark_codings import SplatEncoding
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.gaussian import linear_opacity, spark_size
 from sparklod_cli.model.instances import Instance

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli import write
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats

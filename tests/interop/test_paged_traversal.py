@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs.gpu import lod_tree
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance

@@ -12,7 +12,7 @@ import pytest
 
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.losses import after
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats

@@ -23,7 +23,7 @@ from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_chunk_header, read_header
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spark_codings import SplatEncoding, encode_lod_alpha
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene

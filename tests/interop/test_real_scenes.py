@@ -8,7 +8,7 @@ from importlib import import_module
 import pytest
 
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from tests.conftest import real_scene
 from tests.interop import laws

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.tree_nodes import Nodes

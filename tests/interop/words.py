@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model import gaussian
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats

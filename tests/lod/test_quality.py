@@ -17,7 +17,7 @@ from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.sources import cameras_of, orbit_frames
 from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.images.metrics import on_background, psnr
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.lod.kernels.prune import MOST_CHILDREN, STEPS
 from sparklod_cli.model.gaussian import spark_size

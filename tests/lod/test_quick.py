@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.kernels.cell_pairs import ROUNDS
 from tests.conftest import real_scene

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality, tiles
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.model.scene import Scene

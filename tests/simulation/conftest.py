@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.foveation import Frustum
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.viewers.loaded_scene import TRAVERSED

@@ -17,7 +17,7 @@ import pytest
 import sparklod_cli as sparklod
 from fixtures import by_hand_glb, by_hand_rad
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader, pack_header, read_chunk_header
-from sparklod_cli.io import read_parts
+from sparklod_cli.io.reading import read_parts
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import CameraPathError, FormatError, SparklodError

@@ -12,7 +12,7 @@ import pytest
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
 from sparklod_cli.codecs import ply
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import Splats

@@ -19,7 +19,7 @@ from PIL import Image
 from fixtures import by_hand_sog
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.sog import codec as sog
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import FormatError
@@ -251,7 +251,9 @@ def test_a_pipe_in_the_folder_is_not_waited_for(tmp_path: Path) -> None:
     folder = unpacked(tmp_path, FILES)
     (folder / "means_l.webp").unlink()
     os.mkfifo(folder / "means_l.webp")
-    code = f"from pathlib import Path; from sparklod_cli.io import read_scene; read_scene(Path({str(folder)!r}))"
+    code = (
+        f"from pathlib import Path; from sparklod_cli.io.reading import read_scene; read_scene(Path({str(folder)!r}))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30)
     assert "FormatError: " in done.stderr
     assert "means_l.webp" in done.stderr.splitlines()[-1]

@@ -18,7 +18,7 @@ from sparklod_cli.codecs.options import SogOptions, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.sog import sog_container, webp
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS

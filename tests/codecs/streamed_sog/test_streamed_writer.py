@@ -14,7 +14,8 @@ from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.codecs.streamed_sog.manifest import parse
-from sparklod_cli.io import parts_output, read_parts, read_scene
+from sparklod_cli.io.reading import read_parts, read_scene
+from sparklod_cli.io.writing import parts_output
 from sparklod_cli.model import morton
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats

@@ -18,7 +18,7 @@ from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.tiles_3d import codec
 from sparklod_cli.codecs.tiles_3d.tileset import LARGEST
-from sparklod_cli.io import open_reader, read_parts, read_scene
+from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.tiles import make

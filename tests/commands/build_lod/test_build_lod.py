@@ -19,7 +19,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene

@@ -14,8 +14,7 @@ from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
-from sparklod_cli.io import read_scene
-from sparklod_cli.io.reading import Merged
+from sparklod_cli.io.reading import Merged, read_scene
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats

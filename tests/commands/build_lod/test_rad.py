@@ -13,7 +13,7 @@ from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad.rad_header import read_chunk_header, read_header
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from tests.commands.build_lod.runs import ONE, SMALL, build

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from tests.commands.build_lod.runs import ONE, build
 from tests.conftest import FIXTURES, ROOT, Capture
 from tests.fittings import STEPS, StandIn

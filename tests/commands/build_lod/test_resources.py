@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.bake import estimate
 from sparklod_cli.bake.flow import SCRATCH as SUFFIX
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from tests.commands.build_lod.runs import SMALL, build
 from tests.conftest import FIXTURES, Capture
 

@@ -12,7 +12,7 @@ import pytest
 from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.formats import ENVIRONMENT_FILE
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from tests.commands.build_lod.runs import ONE, SMALL, build
 from tests.conftest import FIXTURES, Capture

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.io import read_parts, read_scene
+from sparklod_cli.io.reading import read_parts, read_scene
 from tests.commands.build_lod.runs import SMALL, build
 from tests.commands.build_lod.test_streamed_sog import TREE, files, written
 from tests.conftest import Capture

@@ -14,7 +14,7 @@ import sparklod_cli as api
 from sparklod_cli.api.viewing import prepare
 from sparklod_cli.cli import run
 from sparklod_cli.images.metrics import psnr
-from sparklod_cli.io import read_parts, read_scene
+from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.model.scene import AXES
 from tests.commands.build_lod.runs import SMALL, build
 from tests.conftest import Capture

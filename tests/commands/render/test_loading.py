@@ -10,7 +10,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from tests.conftest import FIXTURES, Capture
 
 TOWN = FIXTURES / "traverse" / "town.spz"

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.simulation.results import LOADING
 from tests.commands.traverse.runs import ORBIT, OTHER, TOWN, TREE, scene_file, table, traverse
 from tests.conftest import FIXTURES, Capture

@@ -18,7 +18,8 @@ from fixtures import demo_scene
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
-from sparklod_cli.io import parts_output, read_scene
+from sparklod_cli.io.reading import read_scene
+from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import detail_levels, quality
 from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.splats import Splats

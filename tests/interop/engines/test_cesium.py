@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.codecs.formats import TILESET
-from sparklod_cli.io import read_parts, read_scene
+from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.tiles import PIXEL_ERROR
 from sparklod_cli.model.splats import Splats

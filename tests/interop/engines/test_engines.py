@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 import sparklod_cli
-from sparklod_cli.io import read_parts
+from sparklod_cli.io.reading import read_parts
 from sparklod_cli.model.scene import Scene
 from tests.conftest import ROOT
 from tests.interop.engines import PACKAGES, recipes

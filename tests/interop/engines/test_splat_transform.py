@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sparklod_cli.io import read_parts, read_scene
+from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.model.splats import Splats
 from tests.conftest import FIXTURES
 from tests.interop.engines.conftest import Shot, counts_of

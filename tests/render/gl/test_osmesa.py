@@ -10,7 +10,7 @@ import pytest
 
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.codecs.gpu import data_texture
-from sparklod_cli.io import read_scene
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.falloff import MIN_ALPHA
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import FloatArray
