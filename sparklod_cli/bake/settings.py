@@ -14,7 +14,7 @@ from ..model import MAX_SH_DEGREE
 from ..model.selection import Selection
 
 if TYPE_CHECKING:
-    from ..codecs.encoder import Clamp
+    from ..codecs.clamps import Clamp
     from ..fitting.settings import FitSettings, Refined
     from ..lod.part_settings import DetailSettings, TileSettings
     from ..model.transforms import Transform

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-from ..codecs.encoder import CLAMPED, clamps_of, results, windows_of
+from ..codecs.encoder import CLAMPED, results, windows_of
 from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
@@ -156,8 +156,11 @@ def write_windows(
             chunks = (windows(number, codec.CHUNK).tobytes() for number in numbers)
             for each, pieces in encoder.files(chunks, PurePath(name).stem, progress=progress):
                 baked.bytes += out.write(each, pieces)
-    if encoder.ranges:
-        baked.clamped, baked.clamps = clamps_of([windows(number, CLAMPED) for number in numbers], encoder.ranges)
+    tallies = [windows(number, CLAMPED) for number in numbers] if encoder.ranges else []
+    if any(tally[:, 3].any() for tally in tallies):  # splats beyond any range of a column
+        from ..codecs.clamps import clamps_of
+
+        baked.clamped, baked.clamps = clamps_of(tallies, encoder.ranges)
     tree.end("write")
     if not tree.in_chunks:
         baked.output_format, baked.version, baked.fractional_bits = "spz", options.spz_version, options.fractional_bits

@@ -19,7 +19,7 @@ from ..model.scene import Scene
 from ..model.splats import Splats, describe_invalid
 from ..model.transforms import sh_basis
 from ..system.errors import FormatError
-from .encoder import clamps_in
+from .clamps import clamps_in
 from .formats import WRITABLE, Format
 from .options import WriteOptions
 from .reader import decode_file

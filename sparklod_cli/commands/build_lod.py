@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from ..api.bake_jobs import Outcome, Pair
     from ..bake.settings import Baked, Source
     from ..bake.simplifying import Extracted, WrittenSet
-    from ..codecs.encoder import Clamp
+    from ..codecs.clamps import Clamp
     from ..fitting.settings import Refined
     from ..model.instances import Instance
 
@@ -414,7 +414,7 @@ def _written(baked: Baked) -> str:
 
 def _consequences(baked: Baked) -> str:
     """Return a line on the visible effects of clamping; empty without any."""
-    from ..codecs.encoder import clamp_matters
+    from ..codecs.clamps import clamp_matters
 
     shares: dict[str, float] = {}
     for clamp in baked.clamps:

@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import encoder, sh_palette, spz
+from sparklod_cli.codecs import clamps, encoder, sh_palette, spz
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad import rad_options
@@ -52,8 +52,8 @@ def test_windows_are_encoded_anywhere_and_count_what_they_clamp(
     pieces = pickle.loads(sent).pieces(lambda number, name: found[number][name], threads=1, progress=silent)
     assert b"".join(pieces) == b"".join(codec.encode(scene, PALETTE, threads=2))
     tallies = [found[number][encoder.CLAMPED] for number in sorted(found)]
-    expected = encoder.clamps_in(scene.splats, ranges=ranges, tree=scene.tree)
-    assert encoder.clamps_of(tallies, ranges) == expected
+    expected = clamps.clamps_in(scene.splats, ranges=ranges, tree=scene.tree)
+    assert clamps.clamps_of(tallies, ranges) == expected
     assert not sh_degree or set(expected[0]) >= {"sh"}
 
 

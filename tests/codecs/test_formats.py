@@ -43,6 +43,7 @@ def test_a_codec_has_the_signatures_of_all(form: Format) -> None:
         assert parameters(codec.needed) == {"options": False}
         named = {"counting": True, "threads": True, "progress": True}
         assert parameters(codec.encoder) == {"scene": False, "options": False} | named
+        assert parameters(codec.stored) == {"source": False, "options": False}
 
 
 def test_one_format_is_written_by_each_suffix() -> None:

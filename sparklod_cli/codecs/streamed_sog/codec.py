@@ -60,7 +60,10 @@ def decode_parts(
 ) -> DetailScene:
     """Read all detail levels, in any order of the runs in the chunks; regions are in the order of the tree."""
     layout, content = _open(OpenFile(file, open_companion, threads=threads), full_detail=False)
-    bounds, children, errors = layout.bounds(), layout.children(), layout.errors()
+    regions = [node for _, node in layout.manifest.regions()]
+    bounds, children = np.array([node.bound for node in regions], np.float64), layout.children()
+    has_errors = all(node.errors is not None for node in regions)
+    errors = np.array([node.errors for node in regions], np.float64) if has_errors else None
     scene, environment = replace(content, threads=threads).scene(progress=progress), None
     splats = scene.splats
     if layout.manifest.environment is not None:
@@ -87,16 +90,6 @@ class RegionLayout:
     region: Index
     counts: Counts
 
-    def starts(self) -> Counts:
-        """Return (n,) the first splat of each run in a `DetailScene`, level after level."""
-        flat = self.counts.T.ravel()
-        before = np.cumsum(flat) - flat
-        return before[self.level * len(self.counts) + self.region]
-
-    def bounds(self) -> Bounds:
-        """Return (R, 2, 3) lowest and highest corner of each region; all must have a bound."""
-        return np.array([node.bound for _, node in self.manifest.regions()], np.float64)
-
     def children(self) -> Index:
         """Return (R - 1, 2) the tree as in `DetailScene`; it must be a binary one."""
         nodes = self.manifest.nodes
@@ -105,11 +98,6 @@ class RegionLayout:
         numbers[inner] = np.arange(len(inner))
         numbers[[number for number, _ in self.manifest.regions()]] = -1 - np.arange(len(self.counts))
         return numbers[np.array([nodes[number].children for number in inner], np.int64).reshape(-1, 2)]
-
-    def errors(self) -> NDArray[np.float64] | None:
-        """Return (R, L) the error of each region at each level; None unless all regions have errors."""
-        found = [node.errors for _, node in self.manifest.regions()]
-        return None if None in found else np.array(found, np.float64)
 
 
 def layout_of(manifest: Manifest) -> RegionLayout:
@@ -133,8 +121,12 @@ def _open(source: OpenFile, *, full_detail: bool) -> tuple[RegionLayout, Reader]
     manifest = parse(source.file.read(MAX_MANIFEST + 1))
     check_rules(run_violations(manifest) if full_detail else violations(manifest))
     layout = layout_of(manifest)
-    chosen = layout.level == 0 if full_detail else np.ones(len(layout.level), np.bool_)
-    rows = np.cumsum(layout.count * chosen) - layout.count if full_detail else layout.starts()
+    if full_detail:
+        chosen = layout.level == 0
+        rows = np.cumsum(layout.count * chosen) - layout.count
+    else:  # level after level, as in a `DetailScene`
+        chosen, flat = np.ones(len(layout.level), np.bool_), layout.counts.T.ravel()
+        rows = (np.cumsum(flat) - flat)[layout.level * len(layout.counts) + layout.region]
     files, first = np.unique(layout.file, return_index=True)
     names, chunks = set[str](), list[Chunk]()
     ends = np.append(first[1:], len(layout.file))

@@ -14,7 +14,7 @@ import pytest
 
 from fixtures import by_hand_rad
 from sparklod_cli import __version__
-from sparklod_cli.codecs.encoder import clamps_in
+from sparklod_cli.codecs.clamps import clamps_in
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import codec as rad
 from sparklod_cli.codecs.rad import rad_options
