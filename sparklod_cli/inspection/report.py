@@ -293,58 +293,41 @@ NO_CHILDREN = "its splats are the nodes of a tree, but it has no child indices, 
 
 def _of_arrays(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tuple[dict[str, Any], Scene | None]:
     """Return the fields of a report on the arrays of one of `codecs.formats.ENCODINGS`, and the splats if complete."""
-    if "packed" in arrays:
-        # build-lod writes trees, for which Spark stores LoD opacities; the file does not record that.
-        splats = packed_splats.unpack(arrays, SplatEncoding(lod_opacity=True), threads=threads)
-        return _of_splats("PackedSplats", splats, settings)
-    if "ext0" in arrays:
-        return _of_splats("ExtSplats", ext_splats.unpack(arrays, threads=threads), settings)
-    if "lod_tree" in arrays:
-        return _of_tree_arrays(arrays, settings), None
-    if "texture" in arrays:
-        return _of_texture(arrays, settings), None
-    raise FormatError(f"its arrays ({', '.join(arrays)}) match no encoding that build-lod writes")
-
-
-def _of_splats(name: str, splats: Splats, settings: ReportSettings) -> tuple[dict[str, Any], Scene]:
-    scene = Scene(splats, format=f"NPZ of {name}")
-    opaque = dataclasses.replace(splats, opacity=np.minimum(splats.opacity, np.float32(1)))  # merged splats exceed 1
-    return _array_fields(
-        scene.format,
-        len(splats),
-        NO_CHILDREN,
-        settings,
-        sh_degree=splats.sh_degree,
-        values=values.examine(splats, all_quantities=settings.all_quantities) if settings.values else None,
-        findings=values.check(Scene(opaque)) if settings.check else [],
-    ), scene
-
-
-def _of_tree_arrays(arrays: Arrays, settings: ReportSettings) -> dict[str, Any]:
-    nodes = lod_tree.unpack(arrays)
-    count = len(nodes.tree)
-    facts: tree.TreeFacts | None = None
-    findings: list[Finding] = []
-    if count:
-        # Opaque balls of the sizes of the nodes, whose scales and opacities are not stored.
-        balls = Splats.zeros(count, 0)
-        balls.scale[:] = nodes.size[:, None] / 2
-        balls.opacity[:] = 1
-        facts, findings = tree.examine(balls, nodes.tree, check=settings.check)
-        facts = dataclasses.replace(facts, more_than_opaque=None)
-    elif settings.check:
-        findings = [Finding("values.empty", "there are no splats")]
-    note = "it has centres, sizes and children of nodes, but no opacities, colours and shapes"
-    return _array_fields("NPZ of LodTree", count, note, settings, tree=facts, findings=findings)
-
-
-def _of_texture(arrays: Arrays, settings: ReportSettings) -> dict[str, Any]:
-    capacity = data_texture.capacity(arrays)
-    used = np.flatnonzero(np.ascontiguousarray(arrays["texture"]).reshape(capacity, 8).any(axis=1))
-    note = "it has centres, covariances and colours of nodes, but no opacities above 1, SH and children"
-    return _array_fields("NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0, note, settings)
-
-
-def _array_fields(form: str, splats: int, note: str, settings: ReportSettings, **more: Any) -> dict[str, Any]:
-    fields = {"format": form, "splats": splats, "sh_degree": 0, "antialiased": False, "notes": [note], "findings": []}
-    return fields | more | ({} if settings.check else {"findings": None})
+    fields: dict[str, Any] = {"sh_degree": 0, "antialiased": False, "findings": []}
+    scene: Scene | None = None
+    if "packed" in arrays or "ext0" in arrays:
+        if "packed" in arrays:
+            # build-lod writes trees, for which Spark stores LoD opacities; the file does not record that.
+            splats = packed_splats.unpack(arrays, SplatEncoding(lod_opacity=True), threads=threads)
+            scene = Scene(splats, format="NPZ of PackedSplats")
+        else:
+            splats = ext_splats.unpack(arrays, threads=threads)
+            scene = Scene(splats, format="NPZ of ExtSplats")
+        form, count, note, fields["sh_degree"] = scene.format, len(splats), NO_CHILDREN, splats.sh_degree
+        if settings.values:
+            fields["values"] = values.examine(splats, all_quantities=settings.all_quantities)
+        if settings.check:  # merged splats have opacities above 1
+            opaque = dataclasses.replace(splats, opacity=np.minimum(splats.opacity, np.float32(1)))
+            fields["findings"] = values.check(Scene(opaque))
+    elif "lod_tree" in arrays:
+        nodes = lod_tree.unpack(arrays)
+        form, count = "NPZ of LodTree", len(nodes.tree)
+        note = "it has centres, sizes and children of nodes, but no opacities, colours and shapes"
+        if count:
+            # Opaque balls of the sizes of the nodes, whose scales and opacities are not stored.
+            balls = Splats.zeros(count, 0)
+            balls.scale[:] = nodes.size[:, None] / 2
+            balls.opacity[:] = 1
+            facts, fields["findings"] = tree.examine(balls, nodes.tree, check=settings.check)
+            fields["tree"] = dataclasses.replace(facts, more_than_opaque=None)
+        else:
+            fields["findings"] = [Finding("values.empty", "there are no splats")]
+    elif "texture" in arrays:
+        capacity = data_texture.capacity(arrays)
+        used = np.flatnonzero(np.ascontiguousarray(arrays["texture"]).reshape(capacity, 8).any(axis=1))
+        form, count = "NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0
+        note = "it has centres, covariances and colours of nodes, but no opacities above 1, SH and children"
+    else:
+        raise FormatError(f"its arrays ({', '.join(arrays)}) match no encoding that build-lod writes")
+    fields |= {"format": form, "splats": count, "notes": [note]}
+    return fields | ({} if settings.check else {"findings": None}), scene

@@ -95,7 +95,8 @@ class Renderer:
             return DrawnPicture(self._colored(values, (values > 0).astype(np.float32)), values, len(cut))
         fine = finer(camera, times) if times > 1 else camera
         with _KERNELS:
-            shaded = self._shaded(cut, fine)
+            degree = self.settings.max_sh if by is None else 0
+            shaded = shade([(part.splats.with_max_sh(degree), part.object_to_world) for part in cut.parts], fine)
             if by == "depth":
                 shaded, top = colored_by_depth(shaded, fine, self.settings.raster)
             elif self.scale is not None and by is not None:
@@ -115,14 +116,11 @@ class Renderer:
         depth = mean.astype(np.float32)
         return DrawnPicture(self._colored(depth, alpha), depth, len(cut))
 
-    def _shaded(self, cut: Cut, camera: Camera) -> ShadedSplats:
-        degree = self.settings.max_sh if self.settings.color_by is None else 0
-        return shade([(part.splats.with_max_sh(degree), part.object_to_world) for part in cut.parts], camera)
-
     def _overdraw(self, cut: Cut, camera: Camera) -> NDArray[np.float32]:
         fine = finer(camera, self.settings.supersample)
         with _KERNELS:
-            counts = count_overdraw(self._shaded(cut, fine), fine, self._raster)
+            shaded = shade([(part.splats.with_max_sh(0), part.object_to_world) for part in cut.parts], fine)
+            counts = count_overdraw(shaded, fine, self._raster)
         return averaged(counts[..., None], self.settings.supersample)[..., 0]
 
     def _colored(self, values: NDArray[np.float32], alpha: NDArray[np.float32]) -> Image:
