@@ -30,12 +30,7 @@ class Viewer(Protocol):
     instances: list[TreeInstance]
 
     def cut(
-        self,
-        camera: Camera,
-        *,
-        budget: int,
-        smallest: float = 0.0,
-        resident: NDArray[np.bool_] | None = None,
+        self, camera: Camera, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
     ) -> TreeCut:
         """Return the cut that it draws; `TreeCut.wanted` lists the chunks that it asks for.
 

@@ -346,12 +346,7 @@ class PlayCanvasViewer:
         self._before: list[Levels | None] = [None] * len(self.instances)
 
     def cut(
-        self,
-        camera: Camera,
-        *,
-        budget: int,
-        smallest: float = 0.0,
-        resident: NDArray[np.bool_] | None = None,
+        self, camera: Camera, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
     ) -> TreeCut:
         """Return the cut that PlayCanvas draws: the splats of the levels of all regions, and the environments.
 

@@ -59,12 +59,7 @@ class SparkViewer:
                 self._pages.append((slice(*chunks), scene.pages))
 
     def cut(
-        self,
-        camera: Camera,
-        *,
-        budget: int,
-        smallest: float = 0.0,
-        resident: NDArray[np.bool_] | None = None,
+        self, camera: Camera, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
     ) -> TreeCut:
         """Return the cut that Spark draws; see `Viewer.cut`."""
         if resident is not None:
