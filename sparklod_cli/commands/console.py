@@ -190,8 +190,7 @@ class Console(contextlib.AbstractContextManager["Console"]):
     def job(self, shares: Mapping[str, float]) -> Iterator[None]:
         """Show the stages of the work inside as one bar, with the time left.
 
-        Args:
-            shares: the relative time of each stage, in order; other stages add nothing.
+        `shares` has the relative time of each stage, in order; other stages add nothing.
         """
         self.clear()
         whole, begin = sum(shares.values()), 0.0
@@ -252,10 +251,8 @@ class Console(contextlib.AbstractContextManager["Console"]):
     def announce_compiling(self, work: str | BakeSettings | None = None) -> None:
         """Announce the first kernel that is compiled, show which one it is, and print at the end how long all took.
 
-        A problem with the cache concerns every kernel, and is printed once.
-
-        Args:
-            work: a bake, or one of `warmup.JOBS`, whose kernels a second process compiles meanwhile.
+        A problem with the cache concerns every kernel, and is printed once. A second process compiles the kernels of
+        `work`, a bake or one of `warmup.JOBS`, meanwhile.
         """
         from ..system import jit
 

@@ -76,8 +76,7 @@ class NamedPath(click.Path):
 def name_outputs(ctx: click.Context, source: Place | None) -> None:
     """Replace each parameter that is a `Folder` by the path of the file in it, which is named after an input.
 
-    Args:
-        source: the input; None if it is missing, which other checks report.
+    Without an input, which other checks report, do nothing.
     """
     from ..tables.columns import FORMS
 
@@ -94,9 +93,7 @@ def name_outputs(ctx: click.Context, source: Place | None) -> None:
 def require_suffix(flag: str, output: Place, endings: Iterable[str]) -> None:
     """Raise a `click.UsageError` where the name of an output has no suffix, which would choose its format.
 
-    Args:
-        output: a file; standard output, pipes and devices need no suffix.
-        endings: suffixes, and names of files, that are possible.
+    Standard output, pipes and devices need none. `endings` are the possible suffixes and names of files.
     """
     if output == DASH or output.suffix or _is_stream(_status(output)):
         return
@@ -110,12 +107,8 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
     """Raise a `click.UsageError` if an output of a command is also an input or another output of it.
 
     Also if the suffix of an output is that of another format than the written one. Files themselves are compared, so
-    that links and other spellings of a name do not matter. Pipes and devices are never replaced.
-
-    Args:
-        ctx: of the command; its parameters of type `NamedPath` are checked.
-        stands_for: by the name of a parameter, further files that it means: files that an input names, and files that
-            are written into an output folder.
+    that links and other spellings of a name do not matter. Pipes and devices are never replaced. `stands_for` has, by
+    the name of a parameter, further files: those that an input names, and those that are written into a folder.
     """
     stands_for = stands_for or {}
     inputs: list[Place] = []

@@ -151,6 +151,6 @@ def _leave() -> NoReturn:
     if _leaving.acquire(blocking=False):
         with contextlib.suppress(OSError):  # not `sys.stderr`, whose lock the other thread may hold
             os.write(2, b"\r\x1b[Kinterrupted\n" if os.isatty(2) else b"interrupted\n")
-        os._exit(INTERRUPTED)
-    time.sleep(FAREWELL)
+    else:
+        time.sleep(FAREWELL)
     os._exit(INTERRUPTED)

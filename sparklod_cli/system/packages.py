@@ -56,7 +56,6 @@ def install_hint(extra: str = "", *, package: str = "", options: Sequence[str] =
     the packages that are missing.
 
     Args:
-        extra: empty for the requirements without extras.
         package: the only package to install, in the version that the extra requires; empty for all of them.
         options: of pip.
     """

@@ -119,9 +119,7 @@ def _copy_of(stream: Any) -> BinaryIO:
 def write_stdout(pieces: Iterable[bytes], *, may_end: bool = False) -> int:
     """Write to standard output and return the number of bytes; raise `StdoutError` if they cannot be written.
 
-    Args:
-        may_end: a reader may close after the first lines, as head does, which raises `ReaderGoneError`; otherwise that
-            is a `StdoutError`, too.
+    If it `may_end`, a reader that closes it after the first lines, as head does, raises `ReaderGoneError` instead.
     """
     size = 0
     with guarded():

@@ -62,7 +62,7 @@ def parse_json(data: str | bytes, *, keep_surrogates: bool = False, depth: int =
         text = data.removeprefix("\ufeff") if isinstance(data, str) else decoded_text(data)
         value = json.loads(text, parse_int=_whole)
     except RecursionError:
-        raise _too_deep(depth) from None
+        raise ValueError(f"it is nested more than {depth} deep") from None
     replace_surrogates = not keep_surrogates and (_ESCAPED_SURROGATE.search(text) or _SURROGATE.search(text))
     return _checked(value, depth, replace_surrogates=bool(replace_surrogates))
 
@@ -71,10 +71,6 @@ def _whole(digits: str) -> int | float:
     if len(digits) <= MAX_DIGITS:
         return int(digits)
     return min(max(float(digits), -LARGEST), LARGEST)
-
-
-def _too_deep(depth: int) -> ValueError:
-    return ValueError(f"it is nested more than {depth} deep")
 
 
 def _checked(root: Any, depth: int, *, replace_surrogates: bool) -> Any:
@@ -98,7 +94,7 @@ def _checked(root: Any, depth: int, *, replace_surrogates: bool) -> Any:
         if not inner:
             return whole[0]
         containers = inner
-    raise _too_deep(depth)
+    raise ValueError(f"it is nested more than {depth} deep")
 
 
 def well_formed(text: str) -> str:
