@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from ..system.setting_fields import CheckedSettings, Quantity, setting, whole
 from .formats import (
@@ -46,9 +46,8 @@ RAD_ENCODINGS = {
 AUTO = "auto"
 
 
-def _encoding(option: str, plural: str) -> Any:
-    encodings = (AUTO, *RAD_ENCODINGS[option])
-    return setting(f"Encoding of {plural}; auto suits the scene.", encodings, AUTO, name=f"rad_{option}")
+#: The values of their options.
+RAD_CHOICES = {name: (AUTO, *encodings) for name, encodings in RAD_ENCODINGS.items()}
 
 
 @dataclass(frozen=True)
@@ -62,12 +61,14 @@ class RadOptions(CheckedSettings):
 
     HEADING: ClassVar[str] = "RAD"
 
-    center: str = _encoding("center", "centres")
-    alpha: str = _encoding("alpha", "opacities")
-    rgb: str = _encoding("rgb", "colours")
-    scales: str = _encoding("scales", "scales")
-    orientation: str = _encoding("orientation", "rotations")
-    sh: str = _encoding("sh", "spherical harmonics")
+    center: str = setting("Encoding of centres; auto suits the scene.", RAD_CHOICES["center"], AUTO, name="rad_center")
+    alpha: str = setting("Encoding of opacities; auto suits the scene.", RAD_CHOICES["alpha"], AUTO, name="rad_alpha")
+    rgb: str = setting("Encoding of colours; auto suits the scene.", RAD_CHOICES["rgb"], AUTO, name="rad_rgb")
+    scales: str = setting("Encoding of scales; auto suits the scene.", RAD_CHOICES["scales"], AUTO, name="rad_scales")
+    orientation: str = setting(
+        "Encoding of rotations; auto suits the scene.", RAD_CHOICES["orientation"], AUTO, name="rad_orientation"
+    )
+    sh: str = setting("Encoding of spherical harmonics; auto suits the scene.", RAD_CHOICES["sh"], AUTO, name="rad_sh")
     chunked: bool = False
     sh_codes: int | None = setting(
         "Most entries of a palette of spherical harmonics, which a label for each splat points into; None for"

@@ -285,8 +285,9 @@ def _notes(file: BinaryIO, header: PlyHeader, names: Collection[str], needed: Co
     if space is not None:
         elements.remove(COLOR_SPACE)
         notes += (f"its colours are linear ({COLOR_SPACE}), and are read as sRGB: too dark",) if space else ()
-    properties = {*names} - {*needed} - harmless
-    return notes + left_out("property", "properties", properties) + left_out("element", "elements", elements)
+    if properties := {*names} - {*needed} - harmless:
+        notes += left_out("property", "properties", properties)
+    return notes + left_out("element", "elements", elements) if elements else notes
 
 
 def _columns(names: Collection[str], mode: str) -> dict[str, tuple[tuple[str, ...], Coding]]:
