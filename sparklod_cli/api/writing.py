@@ -6,21 +6,20 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING
 
-from ..codecs.formats import DEFAULT_COMPRESSION, MANIFEST
+from ..codecs.formats import DEFAULT_COMPRESSION, MANIFEST, NPZ, RAW_SUFFIXES, WRITABLE, ending_of
+from ..codecs.options import RadOptions, SogOptions, WriteOptions
+from ..codecs.reader import check_valid
+from ..codecs.spark_codings import SplatEncoding
 from ..io.writing import parts_output, scene_output, write_scene
+from ..lod.part_settings import DetailSettings
 from ..model.scene import Scene
 from ..system.errors import FormatError, InvalidSplatsError, memory_errors_translated, naming
 from ..system.output import Output
+from ..system.progress import Progress
 from ..system.threads import thread_count
 from .arguments import ProgressLike, file_path, progress_callback, scene_like
 from .files import OF_FILES, pack
-
-if TYPE_CHECKING:
-    from ..codecs.options import RadOptions, SogOptions, WriteOptions
-    from ..lod.part_settings import DetailSettings
-    from ..system.progress import Progress
 
 
 @dataclass(frozen=True)
@@ -87,12 +86,6 @@ def write(
         TypeError: an option is of another type.
         ValueError: an option is out of its range, or is of another format.
     """
-    from ..codecs.formats import WRITABLE, ending_of
-    from ..codecs.options import RadOptions, SogOptions, WriteOptions
-    from ..codecs.reader import check_valid
-    from ..codecs.spark_codings import SplatEncoding
-    from ..lod.part_settings import DetailSettings
-
     path, count = file_path(path), thread_count(threads)
     form = None if encoding is not None else WRITABLE.get(ending_of(path.name))
     written = None if form is None else form.name
@@ -165,7 +158,6 @@ def _write_levels(
 
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:
-    from ..codecs.formats import NPZ, RAW_SUFFIXES
     from ..codecs.gpu import dump
 
     if path.suffix.lower() not in (NPZ, *RAW_SUFFIXES):

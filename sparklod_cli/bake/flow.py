@@ -59,9 +59,8 @@ def bake(
         say: receives one-line messages for the user.
 
     Raises:
-        FormatError, InvalidSplatsError, OutputError: see `io.open_reader`, `Selection.check`,
-            `reader.check_valid` and `system.output.Output`; or the input has a tree, and the settings do not keep
-            it.
+        FormatError, InvalidSplatsError, OutputError: see `io.open_reader`, `Selection.check`, `reader.check_valid` and
+            `system.output.Output`; or the input has a tree, and the settings do not keep it.
         ScratchError: the scratch folder is full, in use, or belongs to another bake.
         OutOfMemoryError: the scene does not fit into memory.
         CameraPathError: the training cameras cannot be read.

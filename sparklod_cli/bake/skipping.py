@@ -79,7 +79,6 @@ def _read_note(path: Place) -> tuple[BakeIdentity | None, dict[str, Any]]:
 
 
 def _changed_files(target: Place, records: dict[str, Any], *, verify: bool) -> list[str]:
-    """Return the files of an output that differ from their records, in words."""
     files = {_within(target, file): file for file in files_of(target)}
     names = sorted({*files, *records})
     changed = (name for name in names if not _is_same(files.get(name), records.get(name), verify=verify))
@@ -98,7 +97,6 @@ def _is_same(file: Place | None, record: Any, *, verify: bool) -> bool:
 
 
 def _record_of(file: Place) -> dict[str, str]:
-    """Return the stamp and the digest of an output file; at an address, its version for both."""
     stamp = _stamp_of(file)
     return {"stamp": stamp, "content": stamp if isinstance(file, Address) else content_of(file)}
 
