@@ -336,10 +336,13 @@ COLUMNS = {"center": "centres", "scale": "scales", "rgb": "colours", "sh": "refl
 LEAST_SHARE = 0.001
 
 
-def report_baked(console: Console, source: Place, target: str, baked: Baked) -> None:
+def report_baked(console: Console, source: Source, target: str, baked: Baked) -> None:
     """Print a line about the file, and one for each thing that a person should know."""
-    detail, tiles = baked.detail, baked.tiles
-    if tiles is not None:
+    made, detail, tiles = baked.simplified, baked.detail, baked.tiles
+    if made is not None:
+        measured = "" if made.psnr is None else f", PSNR {made.psnr:.2f} dB"
+        contents = f"{count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}"
+    elif tiles is not None:
         place = ", on the Earth" if tiles.georeferenced else ""
         contents = f"{count_of(tiles.tiles, 'tile')} of {count_of(tiles.levels, 'level')}{place}"
     elif detail is not None:
@@ -363,7 +366,24 @@ def report_baked(console: Console, source: Place, target: str, baked: Baked) -> 
         console.say(f"  levels below full detail: {', '.join(levels)}")
     if tiles is not None and tiles.levels > 1:
         console.say(f"  splats level by level: {', '.join(f'{count:,}' for count in tiles.splats)}")
-    _report_tree(console, baked, baked.refine)
+    refine = baked.refine if made is None else made.refine
+    if refine is not None:
+        console.say(f"  {_refined(refine)}")
+    if baked.dropped:
+        from ..model.selection import describe
+
+        console.say(f"  left out: {describe(baked.dropped)}")
+    for note in baked.notes:
+        console.say(f"  {note}")
+    if made is not None:
+        if made.faint > LEAST_SHARE * made.splats:
+            share = percent_of(made.faint / made.splats)
+            console.say(
+                f"  {share} of the splats, merged across wide gaps, are too faint to be drawn; keep more splats"
+            )
+        _report_losses(console, made, made.splats, baked.output_format)
+        console.detail(f"  {baked.format}; {_stages(baked.seconds)}")
+        return
     if baked.clamps and (consequences := _consequences(baked)):
         console.say(f"  {consequences}")
     if not console.verbose:
@@ -378,24 +398,17 @@ def report_baked(console: Console, source: Place, target: str, baked: Baked) -> 
         console.say(f"  out of core in {count_of(baked.blocks, 'block')}; scratch: {written} written, {read} read")
 
 
-def _report_tree(console: Console, baked: Baked, refine: Refined | None) -> None:
-    from ..model.selection import describe
-
-    if refine is not None:
-        gains = [
-            f"{percent_of(share)} {before:.2f} -> {refine.psnr_after[share]:.2f}"
-            for share, before in refine.psnr_before.items()
-        ]
-        seen = f"held-out PSNR {', '.join(gains)} dB" if gains else "no held-out camera sees anything of it"
-        early = "" if refine.is_complete else ", interrupted"
-        console.say(
-            f"  refined in {count_of(refine.steps, 'step')}{early}: {seen};"
-            f" {percent_of(refine.kept)} of the splats fitted have new values"
-        )
-    if baked.dropped:
-        console.say(f"  left out: {describe(baked.dropped)}")
-    for note in baked.notes:
-        console.say(f"  {note}")
+def _refined(refined: Refined) -> str:
+    gains = [
+        f"{percent_of(share)} {before:.2f} -> {refined.psnr_after[share]:.2f}"
+        for share, before in refined.psnr_before.items()
+    ]
+    seen = f"held-out PSNR {', '.join(gains)} dB" if gains else "no held-out camera sees anything of it"
+    early = "" if refined.is_complete else ", interrupted"
+    return (
+        f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
+        f" {percent_of(refined.kept)} of the splats fitted have new values"
+    )
 
 
 def _written(baked: Baked) -> str:
@@ -457,24 +470,6 @@ def report_extracted(console: Console, source: Place, target: str, extracted: Ex
     )
     _report_losses(console, extracted, extracted.splats, extracted.output_format)
     console.detail(f"  {extracted.format}; {_stages(extracted.seconds)}")
-
-
-def report_simplified(console: Console, source: Source, target: str, baked: Baked) -> None:
-    """Print a line about the file of a simplified scene, and what it does not hold."""
-    made = baked.simplified
-    assert made is not None
-    measured = "" if made.psnr is None else f", PSNR {made.psnr:.2f} dB"
-    console.say(
-        f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {target} "
-        f" {count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}, {format_size(baked.bytes)},"
-        f" {sum(baked.seconds.values()):.1f} s"
-    )
-    _report_tree(console, baked, made.refine)
-    if made.faint > LEAST_SHARE * made.splats:
-        share = percent_of(made.faint / made.splats)
-        console.say(f"  {share} of the splats, merged across wide gaps, are too faint to be drawn; keep more splats")
-    _report_losses(console, made, made.splats, baked.output_format)
-    console.detail(f"  {baked.format}; {_stages(baked.seconds)}")
 
 
 def _report_losses(console: Console, losses: Extracted | WrittenSet, splats: int, form: str) -> None:

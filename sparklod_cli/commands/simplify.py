@@ -21,7 +21,7 @@ from ..system.errors import FormatError, SparklodError, naming
 from ..system.setting_fields import Quantity, Range, setting, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
-from .build_lod import record_of, report_simplified
+from .build_lod import record_of, report_baked
 from .command import COMMON, Command, OptionalNumber, check_declared, flag, flags_set, is_set, values_of
 from .console import Console, print_json, say
 from .options.baking import (
@@ -191,7 +191,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
             with naming(name_of(source), FormatError) if len(inputs) == 1 else contextlib.nullcontext():
                 raise baked
         assert isinstance(baked, Baked)
-        report_simplified(console, source, "standard output" if options.output == DASH else str(options.output), baked)
+        report_baked(console, source, "standard output" if options.output == DASH else str(options.output), baked)
         if options.as_json:
             print_json(record_of(source, options.output, baked))
         if interrupts.came.is_set():  # during fitting, which then ends early
