@@ -204,22 +204,6 @@ class NodeRows(NamedTuple):
         return NodeRows(self.node[nodes], self.number[nodes], self.children[nodes])
 
 
-class Batch(NamedTuple):
-    """Merges that were done together.
-
-    Attributes:
-        level: of their cells.
-        families: number of merged nodes.
-        members: number of their children.
-        keys: (families, words) Morton codes of their cells, the highest word first; empty in memory.
-    """
-
-    level: int
-    families: int
-    members: int
-    keys: Keys
-
-
 class VoxelTree:
     """Nodes without a parent, and nodes with one in their final order.
 
@@ -229,7 +213,8 @@ class VoxelTree:
 
     Attributes:
         rows: of the nodes without a parent; views of them do not outlive the next call.
-        batches: in the order of the merges.
+        batches: of merges that were done together, in their order: level of the cells; numbers of merged nodes,
+            and of their children; (families, words) Morton codes of the cells, the highest word first, empty in memory.
     """
 
     def __init__(
@@ -254,7 +239,7 @@ class VoxelTree:
                 come from one stage, in their order. It is emptied, so that memory is freed.
             keys: returns the keys of a batch, by the level and the rows of the merged nodes; None in memory.
         """
-        self.batches = list[Batch]()
+        self.batches = list[tuple[int, int, int, Keys]]()
         self._grid, self._leaves, self._index, self._waiting, self._keys = grid, leaves, index, waiting or {}, keys
         self._joining = {
             level: slice(begin, end)
@@ -379,7 +364,7 @@ class VoxelTree:
                 self.rows.number[merged] = self._total - first[:-1]
                 self.rows.children[merged] = np.diff(first)
                 keys = self._keys(level, self.rows.node[merged]) if self._keys else np.empty((0, 0), np.uint64)
-                self.batches.append(Batch(level, len(merged), len(members), keys))
+                self.batches.append((level, len(merged), len(members), keys))
                 self._used += len(nodes) // 2
         return survivors
 
@@ -431,12 +416,12 @@ class VoxelTree:
             fill_leaves(total, number, self._index, column.reshape(len(column), width), filled.reshape(total, width))
         del given, column  # frees memory if the caller has no reference
         same, end = np.arange(total, dtype=np.uint32), len(parents)
-        for batch in self.batches:
-            with threads_for(batch.members):
+        for _, families, members, _ in self.batches:
+            with threads_for(members):
                 for color in (out.rgb, out.sh.reshape(total, math.prod(sh))):
-                    family = parents[end - batch.families : end]
+                    family = parents[end - families : end]
                     merge_colors(len(family), family, start, count, same, weight, color)
-            end -= batch.families
+            end -= families
         return out, LodTree(count, start), number, parents
 
 
@@ -505,10 +490,10 @@ def advance(
         family=family[:count].copy(),
     )
     batches, with_children = tree.batches[::-1], nodes.take(parents)
-    coarse_first = np.array([LEVELS - batch.level for batch in batches], np.int32)
+    coarse_first = np.array([LEVELS - level for level, *_ in batches], np.int32)
     families = StageFamilies(
-        batch=np.repeat(coarse_first, [batch.families for batch in batches]),
-        key=np.concatenate([*(batch.keys for batch in batches), np.empty((0, plan.parts(0).words), np.uint64)]),
+        batch=np.repeat(coarse_first, [count for _, count, *_ in batches]),
+        key=np.concatenate([*(keys for *_, keys in batches), np.empty((0, plan.parts(0).words), np.uint64)]),
         count=links.child_count[parents],
         nodes=nodes.take(slice(count, None)),
         family=family[count:],
