@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -22,7 +23,11 @@ HEALTHY = {"folder": "/nowhere/kernels-1", "distrusted": [], "wanted": 35, "miss
 
 def answer(monkeypatch: pytest.MonkeyPatch, code: int = 0, out: str = "", err: str = "") -> None:
     """Every program that the doctor runs says the same."""
-    monkeypatch.setattr(doctor, "_run", lambda command: (code, out, err))
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[bytes]:
+        return subprocess.CompletedProcess(command, code, out.encode(), err.encode())
+
+    monkeypatch.setattr(subprocess, "run", run)
 
 
 def lack(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
@@ -45,7 +50,8 @@ def test_this_installation_has_no_problem(monkeypatch: pytest.MonkeyPatch) -> No
     names = {check.name for check in checks}
     assert {"sparklod", "Python", "numpy", "numba", "processors", "memory", "OpenGL", "Open3D"} <= names
     assert {"kernel cache", "extra render", "extra video", "extra parquet", "Node", "Chromium"} <= names
-    assert not names & {"extra dev", "extra test"}
+    extras = metadata.metadata("sparklod").get_all("Provides-Extra") or []
+    assert {f"extra {extra}" for extra in extras} - names == {"extra dev", "extra docs", "extra test"}
     assert begun
     for check in checks:
         assert check.value
@@ -99,11 +105,7 @@ def test_a_missing_extra_is_a_note_that_names_it(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_sparklod_that_is_not_installed_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str, extra: str = "") -> None:
-        raise metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(doctor, "required_by", absent)
-    monkeypatch.setattr(metadata, "metadata", absent)
+    lack(monkeypatch, "sparklod")
     (check,) = doctor._packages()
     assert check.state == "note"
     assert list(doctor._extras()) == []
@@ -233,6 +235,6 @@ def test_an_unexpected_error_in_a_check_is_a_note(monkeypatch: pytest.MonkeyPatc
 
 def test_a_cache_that_others_can_write_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
     about = HEALTHY | {"distrusted": ["compiled code in /nowhere is not used; remove it"]}
-    monkeypatch.setattr(doctor, "_run", lambda command: (0, json.dumps(about), ""))
+    answer(monkeypatch, out=json.dumps(about))
     check = next(iter(doctor._kernels()))
     assert (check.state, check.value, check.advice) == ("problem", "compiled code in /nowhere is not used", "remove it")

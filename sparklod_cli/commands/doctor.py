@@ -91,10 +91,7 @@ def _summary(checks: list[Check]) -> str:
 #: ok: works. note: something optional is missing, or could be better. problem: baking does not work.
 State = Literal["ok", "note", "problem"]
 
-#: Extras for developers of sparklod.
-INTERNAL_EXTRAS = ("dev", "docs", "test")
-
-#: Purposes of the other extras, for display.
+#: Purposes of the extras but those of developers (dev, docs and test), for display.
 PURPOSES = {
     "cloud": "files at addresses such as s3://bucket/scan.ply",
     "cluster": "build-lod on several processes or machines",
@@ -134,32 +131,6 @@ class Check:
     advice: str = ""
 
 
-def check_all(begun: Callable[[str], None] = lambda name: None) -> list[Check]:
-    """Run all checks, the most important first; takes some seconds."""
-    found: list[Check] = []
-    parts: list[tuple[str, Callable[[], Iterator[Check]]]] = [
-        ("versions", _versions),
-        ("packages", _packages),
-        ("kernels", _kernels),
-        ("processors", _processors),
-        ("memory", _memory),
-        ("extras", _extras),
-        ("OpenGL", _opengl),
-        ("Open3D", _open3d),
-        ("NVIDIA card", _card),
-        ("ffmpeg", _ffmpeg),
-        ("Node and Chromium", _programs),
-    ]
-    for name, look in parts:
-        begun(name)
-        try:
-            found.extend(look())
-        except Exception as error:  # doctor must work where things are broken in unexpected ways
-            value = f"cannot be checked ({type(error).__name__}: {error})"
-            found.append(Check(name, "note", value, "please report this, with what sparklod doctor --json prints"))
-    return found
-
-
 def _versions() -> Iterator[Check]:
     yield Check("sparklod", "ok", f"{__version__} in {Path(__file__).parents[1]}")
     system = f"{platform.system()} {platform.release()} on {platform.machine()}"
@@ -170,26 +141,21 @@ def _versions() -> Iterator[Check]:
 
 
 def _packages() -> Iterator[Check]:
-    try:
-        for one in required_by(DISTRIBUTION):
-            advice = pip_install(one.requirement, options=["--upgrade"]) if one.missing else ""
-            yield Check(one.name, "problem" if one.missing else "ok", one.state, advice)
-    except metadata.PackageNotFoundError:
+    if not _is_installed(DISTRIBUTION):
         value = "sparklod itself is not installed, so its requirements are unknown"
         yield Check("packages", "note", value, install_hint())
+        return
+    for one in required_by(DISTRIBUTION):
+        advice = pip_install(one.requirement, options=["--upgrade"]) if one.missing else ""
+        yield Check(one.name, "problem" if one.missing else "ok", one.state, advice)
 
 
 def _extras() -> Iterator[Check]:
-    try:
-        extras = metadata.metadata(DISTRIBUTION).get_all("Provides-Extra") or []
-    except metadata.PackageNotFoundError:
-        return
-    for extra in sorted(set(extras) - set(INTERNAL_EXTRAS)):
+    for extra, purpose in PURPOSES.items() if _is_installed(DISTRIBUTION) else ():
         packages = list(required_by(DISTRIBUTION, extra))
         missing = any(package.missing for package in packages)
-        purpose = f"   # {PURPOSES[extra]}" if extra in PURPOSES else ""
-        advice = f"{install_hint(extra)}{purpose}" if missing else ""
-        yield _optional(f"extra {extra}", ", ".join(f"{each.name} {each.state}" for each in packages), advice)
+        advice = f"{install_hint(extra)}   # {purpose}" if missing else ""
+        yield _optional(f"{EXTRA}{extra}", ", ".join(f"{each.name} {each.state}" for each in packages), advice)
 
 
 # What is compiled, and what it runs on
@@ -213,14 +179,14 @@ def _print_kernels() -> None:
 
 
 def _kernels() -> Iterator[Check]:
-    code, out, err = _run(program_command(KERNELS))
+    _, out, error = _run(program_command(KERNELS))
     try:
         about = json.loads(out.splitlines()[-1])
     except (IndexError, ValueError):
         advice = (
             f"{install_hint(options=['--force-reinstall'])}   # in a new virtual environment, if that does not help"
         )
-        yield Check("kernels", "problem", f"the modules of bakes cannot be imported: {_last_line(err, code)}", advice)
+        yield Check("kernels", "problem", f"the modules of bakes cannot be imported: {error}", advice)
         return
     for text in about["distrusted"]:
         yield Check("kernel cache", "problem", *text.split("; ", 1))
@@ -281,14 +247,14 @@ def _open3d() -> Iterator[Check]:
     try:
         from ..render.open3d.backend import command
         from ..render.open3d.child import PACKAGES
-    except ImportError as error:  # numpy
-        yield Check("Open3D", "note", f"not tried ({error})", install_hint())
+    except ImportError as absent:  # numpy
+        yield Check("Open3D", "note", f"not tried ({absent})", install_hint())
         return
-    code, out, err = _run(command())  # it draws a splat before it looks for requests, of which there are none
+    _, out, error = _run(command())  # it draws a splat before it looks for requests, of which there are none
     try:
         reason = json.loads(out.splitlines()[0]).get("error", "")
     except (IndexError, ValueError):
-        reason = f"it has crashed: {_last_line(err, code)}"
+        reason = f"it has crashed: {error}"
     advice = f"on Debian and Ubuntu: apt install {PACKAGES}   # render --backend open3d draws with it" if reason else ""
     yield _optional("Open3D", reason or "draws", advice)
 
@@ -296,20 +262,18 @@ def _open3d() -> Iterator[Check]:
 def _card() -> Iterator[Check]:
     if not _is_installed("numba-cuda"):
         has_driver = shutil.which("nvidia-smi") is not None
-        advice = install_hint("cuda") if has_driver else ""
         value = "not tried without numba-cuda" if has_driver else "none: no driver is installed"
-        yield _optional("NVIDIA card", value, advice)
+        yield _optional("NVIDIA card", value, install_hint("cuda") if has_driver else "")
         return
-    code, out, err = _run(program_command(CARD))
-    yield Check("NVIDIA card", "note" if code else "ok", _last_line(err, code) if code else out.strip())
+    code, out, error = _run(program_command(CARD))
+    yield Check("NVIDIA card", "note" if code else "ok", error if code else out)
 
 
 def _ffmpeg() -> Iterator[Check]:
     if _is_installed("imageio-ffmpeg"):
-        code, out, err = _run(program_command(FFMPEG))
-        value = _last_line(err, code) if code else out.strip()
-        advice = "install ffmpeg, or set IMAGEIO_FFMPEG_EXE to it   # .mp4 animations take it" if code else ""
-        yield _optional("ffmpeg", value, advice)
+        code, out, error = _run(program_command(FFMPEG))
+        advice = "install ffmpeg, or set IMAGEIO_FFMPEG_EXE to it   # .mp4 animations take it"
+        yield _optional("ffmpeg", error if code else out, advice if code else "")
 
 
 # What only the tests take
@@ -322,8 +286,8 @@ def _programs() -> Iterator[Check]:
         if program is None:
             yield _optional(name, "is not installed", advice)
             continue
-        code, out, err = _run([program, "--version"])
-        value = f"{program} does not run: {_last_line(err, code)}" if code else f"{_last_line(out, code)}, {program}"
+        code, out, error = _run([program, "--version"])
+        value = f"{program} does not run: {error}" if code else f"{out}, {program}"
         yield _optional(name, value, advice if code else "")
 
 
@@ -333,28 +297,22 @@ def _optional(name: str, value: str, advice: str) -> Check:
 
 
 def _is_installed(package: str) -> bool:
-    try:
-        metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return False
-    return True
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        return bool(metadata.version(package))
+    return False
 
 
 def _run(command: list[str]) -> tuple[int, str, str]:
+    """Return the exit status of a program, its output, and the last line of its errors, or else how it ended."""
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=PATIENCE)
     except subprocess.TimeoutExpired:
         return 1, "", f"no answer within {PATIENCE} seconds"
     except OSError as error:
         return 1, "", str(error)
-    return done.returncode, done.stdout.decode("utf-8", "replace"), done.stderr.decode("utf-8", "replace")
-
-
-def _last_line(text: str, code: int) -> str:
-    lines = text.strip().splitlines()
-    if lines:
-        return lines[-1].strip()
-    return f"ended by signal {-code}" if code < 0 else f"exit status {code}"
+    out, errors = (text.decode("utf-8", "replace").strip() for text in (done.stdout, done.stderr))
+    ended = f"ended by signal {-done.returncode}" if done.returncode < 0 else f"exit status {done.returncode}"
+    return done.returncode, out, errors.rpartition("\n")[2].strip() or ended
 
 
 def _size_of(*folders: Path) -> str:
@@ -363,3 +321,32 @@ def _size_of(*folders: Path) -> str:
         with contextlib.suppress(OSError):  # another process has just replaced it
             total += path.stat().st_size
     return f"{total / 1e6:.1f} MB"
+
+
+#: The checks, the most important first.
+CHECKS: dict[str, Callable[[], Iterator[Check]]] = {
+    "versions": _versions,
+    "packages": _packages,
+    "kernels": _kernels,
+    "processors": _processors,
+    "memory": _memory,
+    "extras": _extras,
+    "OpenGL": _opengl,
+    "Open3D": _open3d,
+    "NVIDIA card": _card,
+    "ffmpeg": _ffmpeg,
+    "Node and Chromium": _programs,
+}
+
+
+def check_all(begun: Callable[[str], None] = lambda name: None) -> list[Check]:
+    """Run all `CHECKS`; takes some seconds."""
+    found: list[Check] = []
+    for name, look in CHECKS.items():
+        begun(name)
+        try:
+            found.extend(look())
+        except Exception as error:  # doctor must work where things are broken in unexpected ways
+            value = f"cannot be checked ({type(error).__name__}: {error})"
+            found.append(Check(name, "note", value, "please report this, with what sparklod doctor --json prints"))
+    return found
