@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..io.rad_file import RadFile
+from ..codecs.rad.rad_reader import RadReader
+from ..io.rad_file import reopened
 from ..lod.kernels.tree_links import find_depths, find_parents
 from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_NODES, LodTree
@@ -105,18 +107,19 @@ class ReportBlocks:
         return cls(scene, len(scene.splats), tree is not None, mapped)
 
     @classmethod
-    def of_file(cls, file: RadFile, *, threads: int = 1, progress: Progress = silent) -> ReportBlocks:
-        """Chunks of a file. The first time, all columns are unpacked, to find damage."""
-        header, again = file.header, False
+    def of_file(cls, path: Path, rad: RadReader, *, threads: int = 1, progress: Progress = silent) -> ReportBlocks:
+        """Chunks of a file, which is opened each time. The first time, all columns are unpacked, to find damage."""
+        header, again = rad.header, False
 
         def mapped(work: Callable[[Block], Any], columns: Collection[str], _: int) -> Iterator[Any]:
             nonlocal again
             thorough, again = not again, True
-            for start, splats, tree in file.chunks(columns, thorough=thorough, threads=threads):
-                yield work(Block(start, splats, tree))
-                progress("reading", start + len(splats), header.count, "splat")
+            with reopened(path, rad) as reader:
+                for start, splats, tree in reader.chunks(columns, thorough=thorough, threads=threads):
+                    yield work(Block(start, splats, tree))
+                    progress("reading", start + len(splats), header.count, "splat")
 
-        return cls(file.scene, header.count, header.lod_tree, mapped, in_memory=False)
+        return cls(rad.about(), header.count, header.lod_tree, mapped, in_memory=False)
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,12 @@ import numpy as np
 from ..codecs.formats import RAD
 from ..codecs.gpu import data_texture, ext_splats, lod_tree, packed_splats
 from ..codecs.gpu.dump import Arrays
+from ..codecs.rad.rad_reader import RadReader
 from ..codecs.reader import code_of
 from ..codecs.spark_codings import SplatEncoding
 from ..codecs.spz import KNOWN_FLAGS
 from ..io.local_files import size_of_input
-from ..io.rad_file import RadFile
+from ..io.rad_file import fits
 from ..io.reading import opened, read_arrays, read_scene
 from ..model.scene import Scene
 from ..model.sh import width_of
@@ -57,7 +58,7 @@ class ReportSettings:
         all_quantities: all of their quantities, instead of the main ones.
         headers_only: read no more than headers where a format has those; tree and values are left out.
         at_once: have the whole scene in memory, with all columns, for callers that draw it; False reads RAD files chunk
-            by chunk; None does so with large ones, see `RadFile.fits`.
+            by chunk; None does so with large ones, see `io.rad_file.fits`.
     """
 
     chunks: bool = False
@@ -163,9 +164,10 @@ def inspect(
         if surveyed is not None and settings.headers_only:
             return _report(path, surveyed.head, surveyed), None
         if surveyed is not None and surveyed.field == "rad" and settings.at_once is not True:
-            file = RadFile.open(path)
-            if file is not None and not (settings.at_once is None and file.fits):
-                blocks = ReportBlocks.of_file(file, threads=threads, progress=progress)
+            with opened(path) as (source, _):
+                rad = RadReader.open(source.file, source.open_companion)
+            if settings.at_once is False or not fits(rad.header):
+                blocks = ReportBlocks.of_file(path, rad, threads=threads, progress=progress)
                 return _of_blocks(path, blocks, columns, size, settings, surveyed, threads), None
         if surveyed is None and settings.at_once is not True and not settings.check:
             # Only SPZ files are read by columns. None of their codes is invalid but positions of version 1.

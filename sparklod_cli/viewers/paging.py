@@ -8,12 +8,14 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.framing import SAMPLE, USED, Balls, balls_of
-from ..io.rad_file import RadFile
+from ..codecs.rad.rad_reader import RadReader
+from ..io.rad_file import reopened
 from ..lod.kernels.pixel_scale import NODE
 from ..model.file_coding import FileCoding
 from ..model.instances import Instance
@@ -40,8 +42,7 @@ class Pages:
     threads may use it. Where a chunk is damaged, a `FormatError` names the file.
 
     Args:
-        file: of a tree in chunks of `CHUNK_NODES`.
-        name: of the file, for errors.
+        reader: of a tree in chunks of `CHUNK_NODES`; its file may be closed.
         threads: to decode splats with.
 
     Attributes:
@@ -49,17 +50,17 @@ class Pages:
         depth: (N,) int32 edges from the root, of the nodes that the present chunks lead to; 0 of others.
     """
 
-    def __init__(self, file: RadFile, name: str, nodes_of: NodesOf, threads: int) -> None:
-        self.file, self._name, self._nodes_of, self._threads = file, name, nodes_of, threads
-        self.count = file.header.count
-        self.present = np.zeros(len(file.header.chunks), np.bool_)
+    def __init__(self, path: Path, reader: RadReader, nodes_of: NodesOf, threads: int) -> None:
+        self._path, self.rad, self._nodes_of, self._threads = path, reader, nodes_of, threads
+        self.count = reader.header.count
+        self.present = np.zeros(len(reader.header.chunks), np.bool_)
         self.nodes, self.depth = np.zeros(0, NODE), np.zeros(self.count, np.int32)
         self._lock = threading.Lock()
         self._cache: OrderedDict[int, Splats] = OrderedDict()
         self._kept = LEAST_KEPT
         free = available_memory()
         if free is not None:
-            size = CHUNK_NODES * bytes_of(Splats.empty(1, file.header.max_sh))
+            size = CHUNK_NODES * bytes_of(Splats.empty(1, reader.header.max_sh))
             self._kept = max(LEAST_KEPT, int(KEPT_SHARE * free / size))
 
     def place(self, nodes: NDArray[np.void], depth: NDArray[np.int32]) -> None:
@@ -92,7 +93,7 @@ class Pages:
             (~tree.is_leaf & (first + tree.child_count > self.count), "has children past the last node"),
         ):
             if mask.any():
-                raise TreeError(f"{self._name}: its tree is broken: node {node[np.argmax(mask)]} {what}")
+                raise TreeError(f"{self._path}: its tree is broken: node {node[np.argmax(mask)]} {what}")
 
     def _descend(self, frontier: NDArray[np.int64]) -> None:
         """Set the depths of the nodes below some whose depth is known, in the chunks that are present."""
@@ -104,13 +105,13 @@ class Pages:
             twice = self.depth[children] > 0
             if twice.any() or len(np.unique(children)) < len(children):
                 node = np.repeat(inner, count)[np.argmax(twice)]
-                raise TreeError(f"{self._name}: its tree is broken: node {node} shares children with another node")
+                raise TreeError(f"{self._path}: its tree is broken: node {node} shares children with another node")
             self.depth[children] = np.repeat(self.depth[inner] + 1, count)
             frontier = children[self.present[children >> CHUNK_BITS]]
 
     def splats(self, index: NDArray[np.integer]) -> Splats:
         """Return some splats by their indices, (M,) ascending; decoded chunks are cached for the next ones."""
-        rows = Splats.empty(len(index), self.file.header.max_sh)
+        rows = Splats.empty(len(index), self.rad.header.max_sh)
         numbers, begins = np.unique(index >> CHUNK_BITS, return_index=True)
         ends = itertools.pairwise([*begins.tolist(), len(index)])
         parts = {int(number): slice(*each) for number, each in zip(numbers, ends, strict=True)}
@@ -138,14 +139,14 @@ class Pages:
 
     def blocks(self, columns: Collection[str]) -> Iterator[tuple[Splats, LodTree]]:
         """Yield all chunks in order, with these columns; none of them is cached."""
-        with naming(self._name):
-            for _, splats, tree in self.file.chunks(columns, thorough=False, threads=self._threads):
+        with naming(self._path), reopened(self._path, self.rad) as reader:
+            for _, splats, tree in reader.chunks(columns, thorough=False, threads=self._threads):
                 assert tree is not None
                 yield splats, tree
 
     def _decoded(self, number: int, columns: Collection[str]) -> tuple[Splats, LodTree | None, FileCoding]:
-        with naming(self._name):
-            return self.file.chunk(number, columns)
+        with naming(self._path), reopened(self._path, self.rad) as reader:
+            return reader.chunk(number, columns)
 
 
 @dataclass(eq=False)

@@ -373,7 +373,7 @@ def read_scenes(
 
             if isinstance(found, Pages):
                 assert file is not None
-                empty = replace(found.file.scene, tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
+                empty = replace(found.rad.about(), tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
                 entry = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=found)
             else:
                 entry = _loaded_runs(file, found, through, chunks, threads)
@@ -430,14 +430,15 @@ def _read(
     """
     with naming(path), memory_errors_translated(), opened(path, threads) as (source, form):
         if paged is not None and form.name == RAD and path != DASH:
-            from ..io.rad_file import RadFile
+            from ..codecs.rad.rad_reader import RadReader
+            from ..io.rad_file import fits
             from .paging import Pages
 
             with contextlib.suppress(FormatError):  # which is raised below
-                rad = RadFile.of(path, source)
-                if not rad.fits and rad.header.lod_tree and rad.header.chunk_size == CHUNK_NODES:
+                rad = RadReader.open(source.file, source.open_companion)
+                if not fits(rad.header) and rad.header.lod_tree and rad.header.chunk_size == CHUNK_NODES:
                     nodes = functools.partial(nodes_of, precision=paged, threads=1)
-                    return Pages(rad, str(path), nodes, threads)
+                    return Pages(path, rad, nodes, threads)
         if form.parts is not None and path != DASH:
             parts: DetailScene | TileScene = form.codec().decode_parts(
                 source.file, threads=threads, progress=progress, open_companion=source.open_companion

@@ -15,12 +15,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.cli import run
+from sparklod_cli.codecs.rad.rad_reader import RadReader
 from sparklod_cli.inspection import blocks as blocks_of
 from sparklod_cli.inspection.blocks import ReportBlocks, merged
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.inspection.tree import TreeColumns
 from sparklod_cli.inspection.values import LEVELS, Numbers
-from sparklod_cli.io.rad_file import RadFile
+from sparklod_cli.io.rad_file import reopened
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.scene import Scene
@@ -211,18 +212,19 @@ def test_large_files_are_read_by_chunk_and_others_at_once(tmp_path: Path, monkey
 
 
 def test_a_chunk_is_what_all_of_them_have_in_its_place(tmp_path: Path) -> None:
-    file = RadFile.open(tree(240, chunk=24, max_sh=1, palette=True).write(tmp_path / "a.rad"))
-    assert file is not None
-    for number, (start, splats, nodes) in enumerate(file.chunks({"center", "sh"}, thorough=True, threads=2)):
-        some, tree_of_some, _ = file.chunk(number, {"center"})
-        assert start == 24 * number
-        assert np.array_equal(splats.center, some.center)
-        assert splats.sh.any()
-        assert not some.sh.any()
-        assert nodes is not None
-        assert tree_of_some is not None
-        assert np.array_equal(nodes.child_start, tree_of_some.child_start)
-    assert RadFile.open(FIXTURES / "sh0.ply") is None
+    path = tree(240, chunk=24, max_sh=1, palette=True).write(tmp_path / "a.rad")
+    with path.open("rb") as file:
+        closed = RadReader.open(file)
+    with reopened(path, closed) as reader:
+        for number, (start, splats, nodes) in enumerate(reader.chunks({"center", "sh"}, thorough=True, threads=2)):
+            some, tree_of_some, _ = reader.chunk(number, {"center"})
+            assert start == 24 * number
+            assert np.array_equal(splats.center, some.center)
+            assert splats.sh.any()
+            assert not some.sh.any()
+            assert nodes is not None
+            assert tree_of_some is not None
+            assert np.array_equal(nodes.child_start, tree_of_some.child_start)
 
 
 def numbers_of(kind: str) -> st.SearchStrategy[np.ndarray]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ...model import MAX_SH_DEGREE
 from ...model.file_coding import PLAIN_SCALES, FileCoding, ScaleCoding
 from ...model.lod_tree import LodTree
+from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.errors import FormatError, TooLongError, TruncatedError
@@ -95,10 +96,6 @@ class RadReader:
         reader = cls(header, file, open_companion)
         first = reader.first()
         return reader if first is None else dataclasses.replace(reader, palette=first.palette(header))
-
-    def reopened(self, file: BinaryIO, open_companion: OpenCompanion | None) -> RadReader:
-        """Return a reader of the same file, opened again."""
-        return dataclasses.replace(self, file=file, open_companion=open_companion)
 
     @property
     def facts(self) -> dict[str, int]:
@@ -216,6 +213,10 @@ class RadReader:
             lambda: self.coding(codings),
             max(size, 1),
         )
+
+    def about(self) -> Scene:
+        """Return the scene as it is known before any chunk is read: without splats, and without its tree."""
+        return dataclasses.replace(self.content(), count=0, has_tree=False, coding=None).scene()
 
 
 def open_content(source: OpenFile) -> Reader:
