@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ..images.output import PLOT_BY
-from ..system.errors import OutOfMemoryError, SparklodError, StdoutError, memory_errors_translated
+from ..system.errors import CHECK_FAILED, OutOfMemoryError, SparklodError, StdoutError, memory_errors_translated
 from ..system.output import write_file
 from ..system.setting_fields import setting, whole
 from ..system.stdio import name_of
@@ -326,7 +326,7 @@ class _Job:
 
     def _report(self, name: str, report: Report) -> int:
         checks = self.options.checks
-        status = 3 if checks.holds and report.fails(checks.fail_on) else 0
+        status = CHECK_FAILED if checks.holds and report.fails(checks.fail_on) else 0
         if report.format is None and not checks.holds:
             status = 1
             for finding in report.findings or []:

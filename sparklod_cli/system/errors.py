@@ -7,6 +7,9 @@ import errno
 import math
 from collections.abc import Iterator
 
+#: Exit code of a check or an assertion that does not hold; 1 is a failure, 2 wrong usage.
+CHECK_FAILED = 3
+
 
 class SparklodError(Exception):
     """Base class of all errors meant for the user; the message is one line that says what to do."""

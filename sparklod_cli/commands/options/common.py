@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
+from ...system.errors import CHECK_FAILED
 from ...system.setting_fields import setting, whole
 from ...system.stdio import DASH
 from ..command import COMMON, GENERAL, flag
@@ -107,7 +108,7 @@ def report_outcomes(console: Console, outcomes: Sequence[Outcome], places: Itera
             console.detail(f"  holds: {outcome.message()}{place}")
         else:
             console.error(f"{outcome.message()}{place}")
-    return 0 if all(outcome.held for outcome in outcomes) else 3
+    return 0 if all(outcome.held for outcome in outcomes) else CHECK_FAILED
 
 
 @contextlib.contextmanager
