@@ -12,8 +12,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
-
 from ..model.instances import TOTAL
 from ..system.errors import optional_import
 from ..system.output import check_writable, write_file
@@ -222,6 +220,8 @@ def statistic(name: str, values: Sequence[Number]) -> Number:
     """
     if name in STATISTICS:
         return STATISTICS[name](values)
+    import numpy as np  # which --help does not need
+
     return float(np.percentile(np.array(values, np.float64), int(name[1:])))
 
 
