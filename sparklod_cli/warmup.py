@@ -11,7 +11,6 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from .codecs.formats import RAD_SUFFIX
@@ -21,6 +20,9 @@ from .system.kernel_cache import PACKAGE, KernelCache, stem_of
 from .system.progress import Progress, silent
 from .system.python_process import program_command
 from .system.threads import processors
+
+if TYPE_CHECKING:
+    from .bake.settings import BakeSettings
 
 #: Seconds between updates of the progress bar.
 PATIENCE = 0.1
@@ -85,8 +87,8 @@ def warm_up(*, processes: int, progress: Progress = silent) -> int:
         raise SparklodError("no cache can be written; set NUMBA_CACHE_DIR to a folder that can be written")
     # A module's kernels share code, which one process compiles once.
     modules = [list(group) for _, group in itertools.groupby(wanted, lambda unit: unit.kernel.__module__)]
-    left, cache = iter(modules), jit.CACHE_FOLDER.parent.resolve()
-    children = [CompilingProcess(left, cache) for _ in range(min(processes, len(modules)))]
+    left = iter(modules)
+    children = [CompilingProcess(left) for _ in range(min(processes, len(modules)))]
     with ThreadPoolExecutor(len(children)) as pool:
         running = {pool.submit(child.run) for child in children}
         try:
@@ -112,14 +114,15 @@ class CompilingProcess:
         modules: units left to compile, by module; children share the iterator.
     """
 
-    def __init__(self, modules: Iterator[list[Unit]], cache: Path) -> None:
-        self._modules, self._cache, self._stopped = modules, cache, threading.Event()
+    def __init__(self, modules: Iterator[list[Unit]]) -> None:
+        self._modules, self._stopped = modules, threading.Event()
         self._process: subprocess.Popen[str] | None = None
         self.compiled = 0
 
     def run(self) -> None:
         piped: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        environment = {**os.environ, "NUMBA_CACHE_DIR": str(self._cache)}
+        assert jit.CACHE_FOLDER is not None
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(jit.CACHE_FOLDER.parent.resolve())}
         with subprocess.Popen(program_command(_PROGRAM), env=environment, text=True, **piped) as process:
             self._process = process
             for unit in itertools.chain.from_iterable(self._modules):
@@ -128,9 +131,7 @@ class CompilingProcess:
                 self._compile(process, unit)
 
     def _compile(self, process: subprocess.Popen[str], unit: Unit) -> None:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        assert process.stderr is not None
+        assert process.stdin and process.stdout and process.stderr
         request = json.dumps([unit.kernel.__module__, unit.kernel.py_func.__name__, unit.number])
         try:
             process.stdin.write(f"{request}\n")
@@ -159,9 +160,6 @@ def _compile_requested() -> None:
         kernel.dispatcher.compile(kernel.signatures[number])
         print(flush=True)
 
-
-if TYPE_CHECKING:
-    from .bake.settings import BakeSettings
 
 #: The kernels of a command's jobs that take longest to compile, in the order in which they are called.
 JOBS = {
@@ -214,14 +212,13 @@ def jobs_of(work: str | BakeSettings) -> list[str]:
     """Return the jobs of a bake, or the job of that name."""
     if isinstance(work, str):
         return [work]
-    settings = work
-    jobs = [settings.method]
-    if settings.refine is not None:
+    jobs = [work.method]
+    if work.refine is not None:
         jobs.append("fit")
-    if settings.suffix == RAD_SUFFIX and settings.tiles is None and settings.detail is None:
-        jobs.append("chunks")
-    if settings.detail is not None:
+    if work.detail is not None:
         jobs.append("levels")
+    elif work.suffix == RAD_SUFFIX and work.tiles is None:
+        jobs.append("chunks")
     return jobs
 
 
@@ -240,7 +237,7 @@ class CompileAhead:
         self._changed = threading.Condition()
         self._process: CompilingProcess | None = None
         if self._left and jit.CACHE_FOLDER is not None:
-            self._process = CompilingProcess(self._taken(), jit.CACHE_FOLDER.parent.resolve())
+            self._process = CompilingProcess(self._taken())
             self._thread = threading.Thread(target=self._run, args=(self._process,), daemon=True)
             jit.before_first_call = self.claim
             self._thread.start()

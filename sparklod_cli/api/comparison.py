@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,9 +104,6 @@ class BudgetSummary:
     popping_max: float | None
     popping_frame: int | None
 
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
-
 
 def rows_by_budget(rows: Iterable[Row], budgets: int) -> list[list[Row]]:
     """Return the rows of each of some budgets, in the order of the frames."""
@@ -116,7 +113,7 @@ def rows_by_budget(rows: Iterable[Row], budgets: int) -> list[list[Row]]:
 
 def summarize(rows: Iterable[Row], budgets: Sequence[str]) -> list[BudgetSummary]:
     """Return the summary of the rows of a comparison for each budget, named as it was given."""
-    return [_summary(budget, mine) for budget, mine in zip(budgets, rows_by_budget(rows, len(budgets)), strict=True)]
+    return list(map(_summary, budgets, rows_by_budget(rows, len(budgets))))
 
 
 def _summary(text: str, rows: Sequence[Row]) -> BudgetSummary:
@@ -190,8 +187,6 @@ class Comparison:
         lod: settings of the cuts but for the budget.
         full: full detail; None for the leaves of the trees.
 
-    Raises:
-        SparklodError: a budget is less than one splat for each instance.
     """
 
     def __init__(
@@ -220,9 +215,6 @@ class Comparison:
         Cells of `popping` are empty where a camera does not follow the one before it (`CameraPath.follows`).
 
         Pictures are drawn one after the other, each on all the threads; meanwhile others are measured.
-
-        Raises:
-            SparklodError: full detail covers no pixel of a frame.
         """
         total = len(path.cameras) * len(self.counts)
         for at, row in enumerate(ordered_map(measured, self._pictures(path, threads), min(threads, MEASURERS))):
@@ -351,10 +343,6 @@ def compare_files(
 
     Returns:
         the splats of full detail, all instances together; the summary of each budget; the outcomes of `asserts`.
-
-    Raises:
-        UnfitError: there are both trees and Streamed SOG, or too many instances.
-        SparklodError: a file cannot be written, or a picture cannot be drawn.
     """
     with on_threads(threads):
         comparison = Comparison(scenes, lod, budgets, render)

@@ -3,37 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ..model.splats import COLUMNS
 from ..system.progress import Progress, silent
-from ..viewers.loaded_scene import TRAVERSED
-from ..viewers.scenes import CutFinder, read_scenes
+from ..viewers.scenes import CutFinder
 
 if TYPE_CHECKING:
     from ..cameras.sources import CameraPath
     from ..images.output import PictureOutput
     from ..images.sequence import PictureSettings, WrittenPictures
     from ..lod.budget import Budget
-    from ..model.instances import Instance
     from ..render.settings import RenderSettings
     from ..simulation.results import FrameOutputs, Summary
     from ..tables.assertions import Assertion, Outcome
     from ..tables.columns import Filter, Row
     from ..viewers.scenes import Scenes
     from ..viewers.viewer_settings import LodSettings, StreamingSettings
-
-
-def scenes_of_files(instances: Sequence[Instance], *, plain: bool = True, **how: Any) -> Callable[[], Scenes]:
-    """Return a function that reads the scenes of instances when it is first called.
-
-    Args:
-        plain: read all columns of splats.
-        how: further arguments of `read_scenes`.
-    """
-    return functools.cache(functools.partial(read_scenes, instances, columns=COLUMNS if plain else TRAVERSED, **how))
 
 
 def draw_files(

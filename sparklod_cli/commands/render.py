@@ -36,6 +36,7 @@ from .options.viewing import (
     Inputs,
     check_view,
     files_read,
+    scenes_of,
     with_planes,
 )
 from .paths import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
@@ -171,11 +172,7 @@ class Appearance:
             refuse(ctx, ["alpha"], "cannot be used with --background, which fills what is transparent")
 
     def settings(self, say: Callable[[str], None]) -> RenderSettings:
-        """Return the settings of pictures with the options of the backend; `say` receives a line on the device.
-
-        Raises:
-            BackendError: a card is requested, and none is usable.
-        """
+        """Return the settings of pictures with the options of the backend; `say` receives a line on the device."""
         options = {"sorting": self.sorting, "throttle": self.sort_throttle}
         known = {name: value for name, value in options.items() if value is not None}
         device = "cuda" if self.render.device != "cpu" and uses_card(self.render.device, say) else "cpu"
@@ -350,21 +347,16 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
         least = -(-(cameras.orbit or 1) // cameras.every)
     _output(ctx, options, least).check([], overwrite=True)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.jobs import draw_files, scenes_of_files
+        from ..api.jobs import draw_files
         from ..model.instances import instances_of
 
         if budget is not None and (question := doubt(budget.count)):
             console.say(question)
         console.announce_compiling("pictures")
         lod, render = options.cut.settings(), look.settings(console.say)
-        reads: dict[str, Any] = {
-            "precision": options.cut.precision,
-            "threads": general.threads,
-            "progress": console.progress,
-        }
         # What looks at more than cuts is read whole.
         paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
-        scenes = scenes_of_files(instances, **reads, through=look.through, paged=paged)
+        scenes = scenes_of(options, instances, console, through=look.through, paged=paged)
         path, diff = options.cameras.path(scenes), options.diff
         render = with_planes(ctx, options.cameras, render, path, scenes)
         output, settings = _place(ctx, options, instances, path)
@@ -379,7 +371,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
             output,
             settings,
             loading=None if options.after is None else (options.streaming, options.after),
-            reference=None if diff is None else scenes_of_files(instances_of([diff]), **reads),
+            reference=None if diff is None else scenes_of(options, instances_of([diff]), console),
             overwrite=options.overwrite,
             progress=console.progress,
         )
@@ -416,11 +408,7 @@ def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> Picture
 def _place(
     ctx: click.Context, options: RenderOptions, instances: list[Instance], path: CameraPath
 ) -> tuple[PictureOutput, PictureSettings]:
-    """Return the output of the pictures of a path, and how they become files.
-
-    Raises:
-        SparklodError: a file cannot be written, before work goes into it.
-    """
+    """Return the output of the pictures of a path, and how they become files; refuse it before work goes into it."""
     from ..images.output import WITH_ALPHA
     from ..images.pixels import check_animation, scale_width
     from ..images.sequence import PictureSettings, frame_rate
@@ -511,7 +499,6 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
     output, general, overwrite = options.output, options.general, options.overwrite
     assert not isinstance(output, Folder)  # see `name_outputs`
     from ..api.comparison import COLUMNS, check_chart, compare_files
-    from ..api.jobs import scenes_of_files
 
     table = table_output(output, COLUMNS, overwrite=overwrite, as_json=options.as_json)
     instances = options.inputs.instances()
@@ -530,13 +517,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
         if options.plot is not None:
             check_chart(options.plot, overwrite=overwrite)
         render = dataclasses.replace(options.appearance.settings(console.say), max_sh=options.max_sh)
-        scenes = scenes_of_files(
-            instances,
-            precision=options.cut.precision,
-            threads=general.threads,
-            progress=console.progress,
-            trees_only=True,
-        )
+        scenes = scenes_of(options, instances, console, trees_only=True)
         path = options.cameras.path(scenes)
         check_view(ctx, console, options.cameras, path, scenes())
         render = with_planes(ctx, options.cameras, render, path, scenes)
@@ -561,7 +542,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
         pictures = len(path.cameras) * len(budgets)
         console.detail(f"  {pictures:,} pictures, {time.perf_counter() - start:.2f} s")
         if options.as_json:
-            figures = [each.as_dict() for each in summary]
+            figures = [dataclasses.asdict(each) for each in summary]
             checked = [each.as_dict() for each in outcomes]
             print_json({"frames": len(path.cameras), "leaves": leaves, "budgets": figures, "asserts": checked})
         texts = _lines(summary, path, leaves)

@@ -21,7 +21,7 @@ from ..viewers.viewer_settings import StreamingSettings
 from .command import COMMON, Command, check_declared, flag, refuse, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
 from .options.common import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
-from .options.viewing import Cameras, CutOptions, Inputs, check_view, files_read
+from .options.viewing import Cameras, CutOptions, Inputs, check_view, files_read, scenes_of
 from .paths import NamedPath, claim_stdout, keep_apart, name_outputs
 
 if TYPE_CHECKING:
@@ -146,22 +146,17 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     asserts = options.assertions() if options.asserts else []
     start = time.perf_counter()
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.jobs import scenes_of_files, traverse_files
+        from ..api.jobs import traverse_files
+        from ..model.splats import COLUMNS
+        from ..viewers.loaded_scene import TRAVERSED
 
         if question := doubt(budget.count):
             console.say(question)
         console.announce_compiling("cuts")
         screen = outputs.table.path is None and outputs.table.form is not None and is_terminal(sys.stdout)
         outputs.check()
-        scenes = scenes_of_files(
-            instances,
-            precision=options.cut.precision,
-            threads=general.threads,
-            progress=console.progress,
-            trees_only=True,
-            plain=outputs.plot is not None,
-            paged=True,
-        )
+        columns = TRAVERSED if outputs.plot is None else COLUMNS
+        scenes = scenes_of(options, instances, console, columns=columns, trees_only=True, paged=True)
         path = options.cameras.path(scenes)
         check_view(ctx, console, options.cameras, path, scenes(), options.streaming.network)
         keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from ...render.settings import RenderSettings
     from ...viewers.scenes import Scenes
     from ..console import Console
+    from ..render import RenderOptions
+    from ..traverse import TraverseOptions
 
 #: The options that are each a source of cameras, of which one can be given.
 SOURCES = ("camera_path", "orbit", "dolly", "look_at", "keyframes", "views")
@@ -158,12 +161,7 @@ class Cameras:
             raise click.UsageError("--up 0,0,0 is no direction; give another one")
 
     def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
-        """Return the cameras; scenes are read only where cameras are chosen for them, or need their up axis.
-
-        Raises:
-            CameraPathError: a file cannot be read, or a camera makes no sense.
-            InvalidSplatsError: there is no scene to fit.
-        """
+        """Return the cameras; scenes are read only where cameras are chosen for them, or need their up axis."""
         from ...cameras import sources
         from ...cameras.camera import DEFAULT_SECONDS, Settings
 
@@ -247,11 +245,7 @@ class Inputs:
     )
 
     def instances(self) -> list[Instance]:
-        """Return the instances: each FILE once, untransformed, or those of the instances file.
-
-        Raises:
-            InstancesFileError: the instances file cannot be read.
-        """
+        """Return the instances: each FILE once, untransformed, or those of the instances file."""
         from ...model.instances import instances_of
 
         if not self.files and self.scene is None:
@@ -346,6 +340,16 @@ class CutOptions:
         return replace(self.lod, foveation=foveation, continuous=width)
 
 
+def scenes_of(
+    options: RenderOptions | TraverseOptions, instances: Sequence[Instance], console: Console, **how: Any
+) -> Callable[[], Scenes]:
+    """Return a function that reads the scenes of instances when it is first called; `how` are further arguments."""
+    from ...viewers.scenes import read_scenes
+
+    how |= {"precision": options.cut.precision, "threads": options.general.threads, "progress": console.progress}
+    return functools.cache(functools.partial(read_scenes, instances, **how))
+
+
 def files_read(cameras: Cameras, instances: list[Instance]) -> dict[str, list[Path]]:
     """For `keep_apart`: by the name of an option, the files that it names without being one."""
     splats = [each.source for each in instances if isinstance(each.source, Path)]
@@ -362,11 +366,7 @@ def check_view(
     network: Network | None = None,
     notes: Iterable[str] = (),
 ) -> None:
-    """Print notes on the cameras, further ones, and those on scenes.
-
-    Raises:
-        click.UsageError: an option is for trees, or for Streamed SOG, and the files are something else.
-    """
+    """Print notes on the cameras, further ones, and those on scenes; refuse options for other kinds of files."""
     from ...model.scene import up_notes_of
     from ...viewers.loaded_scene import STREAMED_SOG, TILES, TREE
 
