@@ -8,3 +8,6 @@ FARTHEST = 1e37
 
 #: Axes that may point up in an input; the splats are rotated so that y does.
 UP_AXES = ("y", "-y", "z", "-z")
+
+#: Name of all instances together in tables.
+TOTAL = "total"

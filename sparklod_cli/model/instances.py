@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from . import TOTAL
 from .foveation import Foveation
 from .scene import Scene
 
@@ -22,9 +23,6 @@ if TYPE_CHECKING:
     Source = Path | Scene | DetailScene | TileScene
 
 Matrix = NDArray[np.float64]
-
-#: Name of all instances together in tables.
-TOTAL = "total"
 
 
 @dataclass(frozen=True, eq=False)

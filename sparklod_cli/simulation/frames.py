@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
-from ..model.instances import TOTAL
+from ..model import TOTAL
 from ..system.output import write_file
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map

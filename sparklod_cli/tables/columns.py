@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from ..model.instances import TOTAL
+from ..model import TOTAL
 from ..system.errors import optional_import
 from ..system.output import check_writable, write_file
 from ..system.stdio import DASH

@@ -11,8 +11,9 @@ import numpy as np
 
 from ..cameras.camera import rotation_of
 from ..io.local_files import is_file_name, read_text
+from ..model import TOTAL
 from ..model.foveation import Cones, Foveation, Frustum
-from ..model.instances import TOTAL, Instance, Matrix, names_of
+from ..model.instances import Instance, Matrix, names_of
 from ..model.transforms import LARGEST, scale_of
 from ..system.errors import SparklodError
 from ..system.untrusted import Json, Origin, quoted_value, well_formed
