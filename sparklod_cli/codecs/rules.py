@@ -31,6 +31,11 @@ class RuleViolation:
     fatal: bool = True
 
 
+def violation(format: str, code: str, text: str, *, fatal: bool = True) -> RuleViolation:
+    """Return a violation of a rule of a format, by the last part of its code."""
+    return RuleViolation(f"{format}.{code}", text, fatal)
+
+
 def check_rules(violations: Iterable[RuleViolation]) -> None:
     """Raise a `FormatError` with the code and the text of the first fatal violation."""
     for violation in violations:

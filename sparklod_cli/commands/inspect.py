@@ -22,7 +22,7 @@ from ..system.stdio import name_of
 from ..system.threads import on_threads
 from ..system.units import format_size
 from ..system.untrusted import MOST, printable, shortened
-from .command import COMMON, Command, flag, refuse, values_of
+from .command import COMMON, Command, check_declared, flag, refuse, values_of
 from .console import Console, count_of, rows
 from .options.common import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, assert_errors, table_output
 from .paths import NamedPath, keep_apart, name_outputs
@@ -120,7 +120,10 @@ class InspectOutput:
     overwrite: bool = flag(**OVERWRITE)
     stats: bool = flag("Report statistics of all quantities, not only of the main ones.", heading=COMMON)
     field: str | None = setting(
-        "Print one value of the JSON report, such as tree.leaves, instead of a report.", metavar="NAME", heading=COMMON
+        "Print one value of the JSON report, such as tree.leaves, instead of a report.",
+        excludes=("chunks", "histogram", "style"),
+        metavar="NAME",
+        heading=COMMON,
     )
     html: Path | None = setting(
         "Write the reports as one HTML page, with pictures.",
@@ -147,31 +150,21 @@ class InspectOutput:
 
 def check_usage(ctx: click.Context, count: int, checks: Checks, output: InspectOutput, *, as_json: bool) -> None:
     """Raise a `click.UsageError` where options exclude each other or would do nothing."""
-    if output.plot is not None and count > 1:
-        raise click.UsageError(f"--plot takes one file, not {count}")
-    if output.chunks_out is not None and count > 1:
-        raise click.UsageError(f"--chunks-out takes one file, not {count}")
-    if output.chunks and output.field:
-        raise click.UsageError("--chunks cannot be used with --field")
-    if output.field and as_json:
-        raise click.UsageError("--field cannot be used with --json")
-    if output.histogram and (output.field or as_json):
-        raise click.UsageError(f"--histogram cannot be used with {'--json' if as_json else '--field'}")
+    check_declared(ctx)
+    if count > 1:
+        refuse(ctx, ("plot", "chunks_out"), f"takes one file, not {count}")
     if output.stats and checks.holds and not as_json:
         what = "--check" if checks.check else "expectations"
         raise click.UsageError(f"--stats cannot be used with {what} unless --json is given")
     if not checks.holds:
         refuse(ctx, ("style", "fail_on"), "needs --check or an expectation")
-    if as_json or output.field:
-        refuse(ctx, ("style",), f"cannot be used with {'--json' if as_json else '--field'}")
     if output.plot is None and output.html is None:
         refuse(ctx, ("plot_level", "plot_by"), "needs --plot or --html")
-    for name in output.histogram:
+    if output.histogram:
         from ..inspection.values import QUANTITIES
 
-        if name not in QUANTITIES:
-            known = ", ".join(QUANTITIES)
-            raise click.UsageError(f"--histogram: there is no quantity {name}; choose one of {known}")
+        for name in (each for each in output.histogram if each not in QUANTITIES):
+            raise click.UsageError(f"--histogram: there is no quantity {name}; choose one of {', '.join(QUANTITIES)}")
 
 
 @dataclass(frozen=True)
@@ -188,7 +181,7 @@ class InspectOptions:
     )
     checks: Checks = dataclasses.field(default_factory=Checks)
     output: InspectOutput = dataclasses.field(default_factory=InspectOutput)
-    as_json: bool = flag(EACH_AS_JSON, **JSON)
+    as_json: bool = flag(EACH_AS_JSON, excludes=("field", "histogram", "style"), **JSON)
     general: _InspectGeneral = dataclasses.field(default_factory=_InspectGeneral)
 
 

@@ -174,9 +174,13 @@ def _by_budget(
     axes.set_xticks(share)
     axes.xaxis.set_major_formatter(lambda value, place: percent_of(value))
     axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
+    _named(axes, title, unit, loc="lower right", ncols=4)
+
+
+def _named(axes: Axes, title: str, unit: str, **legend: Any) -> None:
     axes.set_title(title)
     axes.set_ylabel(unit)
-    axes.legend(loc="lower right", ncols=4, borderpad=0, handlelength=1.4)
+    axes.legend(borderpad=0, handlelength=1.4, **legend)
 
 
 def _by_frame(axes: Axes, series: Sequence[BudgetRows], name: str, title: str, unit: str) -> None:
@@ -188,9 +192,7 @@ def _by_frame(axes: Axes, series: Sequence[BudgetRows], name: str, title: str, u
         axes.plot(frames.x, frames.column(name), color=COLORS[at % len(COLORS)], linewidth=1.4, label=budget)
         axes.xaxis.set_major_formatter(frames.tick)
         axes.set_xlim(frames.x[0], frames.x[-1])
-    axes.set_title(title)
-    axes.set_ylabel(unit)
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(series), borderpad=0, handlelength=1.4)
+    _named(axes, title, unit, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(series))
 
 
 #: Height of a row of two charts, pixels.
@@ -217,30 +219,28 @@ class Panel:
 
 
 def _drawn(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
-    _stack(axes, frames, (("leaves", "leaves", GREEN), ("merged", "interior", BLUE)))
+    _stack(axes, frames, matplotlib, (("leaves", "leaves", GREEN), ("merged", "interior", BLUE)))
     budget = frames.column("budget")
     axes.plot(frames.x, budget, color=YELLOW, linewidth=1.4, label="budget")
     axes.set_ylim(0, max(axes.get_ylim()[1], 1.05 * float(np.nanmax(budget))))
-    _counted(axes, matplotlib)
-    axes.set_ylabel("splats")
     return frames.column("selected")
 
 
 def _where(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     parts = (("inside", "in_frustum", GREEN), ("outside", "outside", BLUE), ("behind", "behind", INDIGO))
-    _stack(axes, frames, parts)
-    _counted(axes, matplotlib)
-    axes.set_ylabel("splats")
+    _stack(axes, frames, matplotlib, parts)
     return frames.column("in_frustum")
 
 
-def _stack(axes: Axes, frames: FrameColumns, parts: Sequence[tuple[str, str, str]]) -> None:
+def _stack(axes: Axes, frames: FrameColumns, matplotlib: ModuleType, parts: Sequence[tuple[str, str, str]]) -> None:
     floor = np.zeros(len(frames.x))
     for label, name, color in parts:
         top = floor + np.nan_to_num(frames.column(name))
         axes.fill_between(frames.x, floor, top, color=color, linewidth=0, label=label)
         floor = top
     axes.set_ylim(0, max(float(floor.max()) * 1.03, 1))
+    _counted(axes, matplotlib)
+    axes.set_ylabel("splats")
 
 
 def _from_zero(axes: Axes, values: Series) -> None:

@@ -245,14 +245,13 @@ def _fitting(text: str, width: int, draw: ImageDraw.ImageDraw, font: Font) -> st
     text = "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in marks)
 
     def cut(length: int) -> str:
-        return text if length == len(text) else text[:length].rstrip() + "…"
+        return text[:length].rstrip() + "…"
 
-    def fits(length: int) -> bool:
-        return bool(draw.textlength(cut(length), font=font) <= width)
-
-    if fits(len(text)):
+    if draw.textlength(text, font=font) <= width:
         return text
-    longest = bisect.bisect_left(range(1, len(text)), True, key=lambda length: not fits(length))
+    longest = bisect.bisect_left(
+        range(1, len(text)), True, key=lambda length: draw.textlength(cut(length), font=font) > width
+    )
     return cut(longest) if longest else ""
 
 

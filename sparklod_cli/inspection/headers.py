@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from ..codecs.merging import Chunk
 from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16
-from ..codecs.rad.rad_header import ENCODING_KEYS, RadChunkHeader, RadHeader
+from ..codecs.rad.rad_header import RadChunkHeader, RadHeader, encoding_fields
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.rules import RuleViolation
@@ -148,9 +148,6 @@ def survey_rad(file: BinaryIO, open_companion: OpenCompanion, *, check: bool) ->
 def _rad_facts(header: RadHeader, chunks: Sequence[RadChunkHeader]) -> RadFacts:
     sizes = [entry.bytes for entry in header.chunks]
     total = header.bytes + sum(sizes)
-    ranges = None
-    if header.encoding is not None:
-        ranges = {key: getattr(header.encoding, name) for key, name in ENCODING_KEYS.items()}
     properties = {}
     for name in BY_NAME:  # a finding reports unknown names and encodings
         stored = (each for chunk in chunks for each in chunk.properties if each.name == name)
@@ -172,7 +169,7 @@ def _rad_facts(header: RadHeader, chunks: Sequence[RadChunkHeader]) -> RadFacts:
         chunk_size=header.chunk_size,
         chunk_bytes=ChunkBytes.of(sizes),
         palette=header.sh_code_count or 0,
-        ranges=ranges,
+        ranges=encoding_fields(header.encoding),
         comment=_line(header.comment),
         properties=properties,
     )

@@ -24,7 +24,7 @@ from ...system.untrusted import Json, Origin, quoted_value
 from ..formats import RAD_SUFFIX, rad_chunk_name
 from ..quantize import LARGEST
 from ..reader import FileNote, read_comment
-from ..rules import RuleViolation
+from ..rules import RuleViolation, violation
 from ..spark_codings import SplatEncoding
 from .property_codings import BY_NAME, CODINGS, GZ, PROPERTIES, Property, Row
 
@@ -213,7 +213,7 @@ def read_chunk_header(file: BinaryIO) -> RadChunkHeader:
 
 def pack_header(header: RadHeader) -> bytes:
     """Return the bytes of a file's header, padding included; its `bytes` and `padded_with_zeros` are ignored."""
-    chunks = [_present(offset=each.offset, bytes=each.bytes, filename=each.filename) for each in header.chunks]
+    chunks = [_present(**vars(each)) for each in header.chunks]
     fields = {
         "version": VERSION,
         "type": TYPE,
@@ -223,7 +223,7 @@ def pack_header(header: RadHeader) -> bytes:
         "chunkSize": header.chunk_size,
         "allChunkBytes": header.all_chunk_bytes,
         "chunks": chunks,
-        "splatEncoding": _encoding_fields(header.encoding),
+        "splatEncoding": encoding_fields(header.encoding),
         "shCodeCount": header.sh_code_count,
         "comment": header.comment,
     }
@@ -233,15 +233,7 @@ def pack_header(header: RadHeader) -> bytes:
 def pack_chunk_header(header: RadChunkHeader) -> bytes:
     """Return the bytes of a chunk's header up to its payload; the fields about what was read are ignored."""
     properties = [
-        _present(
-            offset=each.offset,
-            bytes=each.bytes,
-            property=each.name,
-            encoding=each.encoding,
-            compression=each.compression,
-            min=each.min,
-            max=each.max,
-        )
+        _present(**{"property" if key == "name" else key: value for key, value in vars(each).items()})
         for each in header.properties
     ]
     fields = {
@@ -251,7 +243,7 @@ def pack_chunk_header(header: RadChunkHeader) -> bytes:
         "payloadBytes": header.payload_bytes,
         "maxSh": header.max_sh,
         "lodTree": header.lod_tree or None,
-        "splatEncoding": _encoding_fields(header.encoding),
+        "splatEncoding": encoding_fields(header.encoding),
         "properties": properties,
     }
     return _pack_json(CHUNK_MAGIC, fields) + PAYLOAD.pack(header.payload_bytes)
@@ -266,7 +258,8 @@ def _pack_json(magic: bytes, fields: dict[str, Any]) -> bytes:
     return PREFIX.pack(magic, len(data)) + data + bytes(padding(len(data)))
 
 
-def _encoding_fields(encoding: SplatEncoding | None) -> dict[str, float | bool] | None:
+def encoding_fields(encoding: SplatEncoding | None) -> dict[str, float | bool] | None:
+    """Return "splatEncoding" of a header; None without ranges."""
     return None if encoding is None else {key: getattr(encoding, name) for key, name in ENCODING_KEYS.items()}
 
 
@@ -355,11 +348,7 @@ WARNINGS = {
 
 #: Bytes of a file in which Spark looks for the header at first, and at most.
 FIRST_LOOK, LAST_LOOK = 1 << 16, 1 << 20
-
-
-def broken(code: str, text: str, *, fatal: bool = True) -> RuleViolation:
-    """Return a violation by the last part of its code."""
-    return RuleViolation(f"rad.{code}", text, fatal)
+broken = functools.partial(violation, "rad")
 
 
 def expected_chunks(header: RadHeader) -> int:
@@ -424,6 +413,7 @@ def _places(header: RadHeader, file_size: int, files: Mapping[str, int | str] | 
         by_file[entry.filename].append((number, entry))
     for name, entries in by_file.items():
         at, in_order = 0, True
+        size: int | str
         for number, entry in entries:
             if entry.offset < at:
                 yield broken("offsets", f"chunk {number:,} begins at {entry.offset:,}, inside the one before it")
@@ -436,29 +426,19 @@ def _places(header: RadHeader, file_size: int, files: Mapping[str, int | str] | 
                 yield broken("padding", text, fatal=False)
             at = max(at, entry.offset + entry.bytes)
         if name is not None and files is not None:
-            yield from _end_of_file(name, files[name], at, entries[-1][0])
+            size, code, subject = files[name], "rad.chunk-files", quoted_value(name)
+            followed = f"the chunk in {subject}"
         elif name is None and in_order:
-            yield from _end(file_size - header.bytes, at, entries[-1][0])
-
-
-def _end(size: int, end: int, last: int) -> Iterator[RuleViolation]:
-    """Check the end of the header's file, which has `size` bytes behind the header."""
-    if size < end:
-        yield RuleViolation("container.cut-short", f"cut short: it lacks {end - size:,} bytes of chunk {last:,}")
-    elif size > end:
-        yield RuleViolation("container.trailing", f"{size - end:,} bytes follow its last chunk", fatal=False)
-
-
-def _end_of_file(name: str, size: int | str, end: int, last: int) -> Iterator[RuleViolation]:
-    """Check the end of another file."""
-    if isinstance(size, str):
-        yield broken("chunk-files", size)
-    elif size < end:
-        text = f"cut short: {quoted_value(name)} lacks {end - size:,} bytes of chunk {last:,}"
-        yield broken("chunk-files", text)
-    elif size > end:
-        text = f"{size - end:,} bytes follow the chunk in {quoted_value(name)}"
-        yield RuleViolation("container.trailing", text, fatal=False)
+            size, code, subject = file_size - header.bytes, "container.cut-short", "it"
+            followed = "its last chunk"
+        else:
+            continue
+        if isinstance(size, str):
+            yield RuleViolation(code, size)
+        elif size < at:
+            yield RuleViolation(code, f"cut short: {subject} lacks {at - size:,} bytes of chunk {entries[-1][0]:,}")
+        elif size > at:
+            yield RuleViolation("container.trailing", f"{size - at:,} bytes follow {followed}", fatal=False)
 
 
 def chunk_violations(header: RadHeader, number: int, chunk: RadChunkHeader, size: int) -> Iterator[RuleViolation]:

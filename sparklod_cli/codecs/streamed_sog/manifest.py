@@ -29,7 +29,7 @@ from .. import quantize
 from ..formats import MANIFEST, ZIP
 from ..merging import Chunk, SceneFiles, not_finite
 from ..reader import FileNote, OpenCompanion, code_of, read_note
-from ..rules import RuleViolation, count_outside, leads_away, nodes_of, parse_manifest, place_of
+from ..rules import RuleViolation, count_outside, leads_away, nodes_of, parse_manifest, place_of, violation
 from ..sog import codec as sog
 from ..sog import texel_codings
 from ..sog.sog_container import MAX_META, image_names, parse_meta
@@ -260,11 +260,7 @@ WARNINGS = {
 
 #: By how much two equal bounds may differ, as a share of their largest number: seven digits are written.
 ROUNDING = 1e-5
-
-
-def broken(code: str, text: str, *, fatal: bool = True) -> RuleViolation:
-    """Return a violation by the last part of its code."""
-    return RuleViolation(f"streamed-sog.{code}", text, fatal)
+broken = functools.partial(violation, "streamed-sog")
 
 
 def regions_of(manifest: Manifest) -> Iterator[tuple[int, Mapping[int, Run], ManifestNode]]:
@@ -523,8 +519,8 @@ def scan_splats(
     def broken_by(chunk: Chunk, splats: Splats) -> Iterator[RuleViolation]:
         here = runs[chunk.name]
         # Those of level 0 are found by the report on the scene, which they are.
-        if any(level for _, level, _ in here) and (violation := not_finite(chunk, splats)) is not None:
-            yield violation
+        if any(level for _, level, _ in here) and (unusable := not_finite(chunk, splats)) is not None:
+            yield unusable
             return
         steps = np.ptp(texel_codings.sign_log(splats.center), axis=0) / texel_codings.LAST_WORD if len(splats) else 0.0
         for number, level, run in here:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import posixpath
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +18,7 @@ from ...system.untrusted import quoted_value
 from ..glb.attributes import COMPRESSION, EXTENSION
 from ..glb.glb_container import product
 from ..merging import Chunk, SceneFiles, not_finite
-from ..rules import LOOSE_BOUND, RuleViolation, count_outside, error_of, leads_away
+from ..rules import LOOSE_BOUND, RuleViolation, count_outside, error_of, leads_away, violation
 from .tileset import (
     CONTENT_GLTF,
     OLD_VERSION,
@@ -66,11 +67,7 @@ ROUNDING = 1e-5
 
 #: The extensions by which a tile is splats, see `glb.codec`.
 SPLAT_EXTENSIONS = (EXTENSION, COMPRESSION)
-
-
-def broken(code: str, text: str, *, fatal: bool = True) -> RuleViolation:
-    """Return a violation by the last part of its code."""
-    return RuleViolation(f"tiles.{code}", text, fatal)
+broken = functools.partial(violation, "tiles")
 
 
 def read_violations(tileset: Tileset) -> Iterator[RuleViolation]:
@@ -315,8 +312,8 @@ def scan_splats(
     volumes, numbers = volumes_of(tileset), {chunk.name: number for number, chunk in chunks.items()}
 
     def broken_by(chunk: Chunk, splats: Splats) -> Iterator[RuleViolation]:
-        if (violation := not_finite(chunk, splats)) is not None:
-            yield violation
+        if (unusable := not_finite(chunk, splats)) is not None:
+            yield unusable
             return
         volume, place = volumes[numbers[chunk.name]], tileset.place(numbers[chunk.name])
         outside = _outside(splats, volume, to_tileset(chunk.up)) if isinstance(volume, Volume) else 0
