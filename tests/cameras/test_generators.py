@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 
 from sparklod_cli.cameras import sources
 from sparklod_cli.cameras.camera import Frame, Intrinsics, Settings, look_at
-from sparklod_cli.cameras.keyframes import (
+from sparklod_cli.cameras.sources import (
     Key,
     between,
+    cameras_of,
     cardinal_tangents,
     catmull_rom_tangents,
     centripetal_knots,
     hermite,
 )
-from sparklod_cli.cameras.sources import cameras_of
 from sparklod_cli.system.errors import CameraPathError
 
 DOWN_Y = (0.0, -1.0, 0.0)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from sparklod_cli.cameras import keyframes, sources
+from sparklod_cli.cameras import sources
 from sparklod_cli.cameras.framing import FILLED, Balls
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.commands.command import Command, values_of
@@ -238,8 +238,7 @@ def test_too_many_generated_cameras_are_refused(options: tuple[str, ...], monkey
         made.append(1)
         return whole(*arguments)
 
-    for module in (sources, keyframes):
-        monkeypatch.setattr(module, "frame_looking", counted)
+    monkeypatch.setattr(sources, "frame_looking", counted)
     output = " ".join(usage_error(*options).split())
     assert f"{options[0]}: it has 1," in output
     assert "cameras, more than 65,536; leave some out with --every" in output

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.model.tree_nodes import Nodes
+from sparklod_cli.simulation.frames import Changes, CutStatistics, measure
 from sparklod_cli.viewers.cut import TreeCut, TreeInstance
-from sparklod_cli.viewers.frame_statistics import Changes, CutStatistics, measure
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.lod.forests import Case, cases, drawn, expected_cut, links, views

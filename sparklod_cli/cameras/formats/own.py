@@ -11,7 +11,7 @@ import numpy as np
 from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
 from ..camera import NO_LENS, Frame, Intrinsics, Settings, frame_looking
-from ..keyframes import Key, between
+from ..sources import Key, between
 from .parsing import CameraJson, Files, Parsed, finite, posed, side
 from .table import Axes
 

@@ -15,7 +15,7 @@ import numpy as np
 from ...system.errors import CameraPathError
 from ...system.untrusted import quoted_value
 from ..camera import Frame, Intrinsics, Matrix, Numbers, Settings, frame_looking
-from ..keyframes import along, cardinal_tangents, hermite
+from ..sources import along, cardinal_tangents, hermite
 from .parsing import CameraJson, Files, Parsed
 
 UP = (0.0, 1.0, 0.0)
