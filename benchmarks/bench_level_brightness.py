@@ -18,7 +18,7 @@ import numpy as np
 import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.lod import detail_levels, quality
+from sparklod_cli.lod import parts, quality
 from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.scene import Scene
 from tests.interop.engines.browser import Browser, Shown
@@ -37,7 +37,7 @@ BABYLON_OFF = {"Compensation = true": "Compensation = false"}
 def levels_of(path: Path, folder: Path) -> tuple[list[Path], Camera]:
     """Write each detail level of a scene as a SOG, and return the files with a camera that sees the scene."""
     splats = sparklod.read(path).splats.with_max_sh(0)
-    scene = detail_levels.make(*quality.build(splats, 2.0), DetailSettings(LEVELS))
+    scene = parts.make_levels(*quality.build(splats, 2.0), DetailSettings(LEVELS))
     files = [folder / f"{path.stem}-{level}.sog" for level in range(scene.levels)]
     for level, file in enumerate(files):
         sparklod.write(file, Scene(scene.splats.take(scene.level(level))))

@@ -19,8 +19,8 @@ import sparklod_cli
 from sparklod_cli.bake import parts_output
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod import quality
-from sparklod_cli.lod.detail_levels import detail_cuts, make, owners_of
 from sparklod_cli.lod.part_settings import DetailSettings
+from sparklod_cli.lod.parts import detail_cuts, make_levels, owners_of
 from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.render import rasterizer
@@ -162,7 +162,7 @@ def main() -> None:
         count = len(splats)
         nodes, tree = quality.build(splats, 2.0)
         most = max(1, int(count * (1 + sum(SHARES)) / options.regions))
-        scene = make(nodes, tree, DetailSettings(levels=SHARES, chunk_splats=most, extent=1e9, min_splats=1))
+        scene = make_levels(nodes, tree, DetailSettings(levels=SHARES, chunk_splats=most, extent=1e9, min_splats=1))
         ways = {"tree": tree_errors(nodes, tree, scene)}
         for width in options.widths:
             parts_output.LEAST_WIDTH, parts_output.MOST_WIDTH = min(width, 64), width

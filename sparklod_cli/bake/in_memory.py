@@ -48,7 +48,7 @@ def build(tree: BuiltTree, source: Source, threads: int, progress: Progress) -> 
     if tally.dropped or not len(splats):
         settings.selection.check(tally)
     if settings.environment_beyond is not None:
-        from ..lod.detail_levels import beyond
+        from ..lod.parts import beyond
 
         if (far := beyond(splats, settings.environment_beyond)).any():
             if tree.environment is None:

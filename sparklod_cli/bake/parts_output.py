@@ -88,11 +88,11 @@ def write_levels(
         end: called with the name of each stage before the last one, when it is done.
     """
     from ..codecs.streamed_sog.codec import encode_files
-    from ..lod.detail_levels import make
+    from ..lod.parts import make_levels
 
     assert scene.tree is not None
     with on_threads(threads):
-        made = make(scene.splats, scene.tree, settings, progress=progress)
+        made = make_levels(scene.splats, scene.tree, settings, progress=progress)
     end("levels")
     errors = measured(made, threads=threads, progress=progress)
     end("errors")
@@ -122,11 +122,11 @@ def write_tiles(
 ) -> tuple[int, WrittenTiles]:
     """Make the tiles of a tree and write them as 3D Tiles; see `write_levels`."""
     from ..codecs.tiles_3d.codec import encode_files
-    from ..lod.tiles import make
+    from ..lod.parts import make_tiles
 
     assert scene.tree is not None
     with on_threads(threads):
-        made = make(scene.splats, scene.tree, settings, progress=progress)
+        made = make_tiles(scene.splats, scene.tree, settings, progress=progress)
     made = dataclasses.replace(made, antialiased=scene.antialiased, up=scene.up)
     end("tiles")
     with out:

@@ -46,7 +46,7 @@ class BakeSettings:
         detail, tiles: to write a Streamed SOG, or 3D Tiles, instead.
         environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
         environment_beyond: of a Streamed SOG, distance beyond which splats become its environment, in the input's
-            units, see `lod.detail_levels.beyond`; None for none.
+            units, see `lod.parts.beyond`; None for none.
         simplify: to write the splats of a cut, without a tree, instead.
         refine: fitting of merged splats to pictures of full detail, without its cameras; None for none.
         camera_path: a file of training cameras, or of those by which a PSNR is measured, in the coordinates of the

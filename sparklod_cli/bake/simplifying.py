@@ -192,7 +192,7 @@ def simplified(
         FormatError, SparklodError: see `count_for` and `Fidelity`; or nothing could be seen of the cut.
         KeyboardInterrupt: see `refined`.
     """
-    from ..lod.detail_levels import RefinementOrder, with_plain_opacity
+    from ..lod.parts import RefinementOrder, with_plain_opacity
 
     assert tree.tree is not None
     progress("simplifying", 0, 1, "cut")

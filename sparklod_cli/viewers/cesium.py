@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..lod.tiles import PIXEL_ERROR
+from ..lod.parts import PIXEL_ERROR
 from ..model.traversed import TileScene
 from .cut import Forest, TreeCut, TreeInstance
 from .loaded_scene import TILES, Index, LoadedScene, bytes_of, cut_of_runs

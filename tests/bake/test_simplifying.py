@@ -11,7 +11,7 @@ import sparklod_cli as sparklod
 from sparklod_cli.bake.simplifying import CLOSE_BYTES, CLOSE_COUNT, SimplifyGoal, count_for
 from sparklod_cli.fitting.pictures import FittedNodes
 from sparklod_cli.lod.budget import parse_budget
-from sparklod_cli.lod.detail_levels import RefinementOrder
+from sparklod_cli.lod.parts import RefinementOrder
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.system.progress import silent
 from tests.scenes import random_splats

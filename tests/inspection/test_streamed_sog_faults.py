@@ -22,7 +22,7 @@ from sparklod_cli.codecs.streamed_sog.manifest import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io.reading import read_parts
 from sparklod_cli.io.writing import parts_output
-from sparklod_cli.lod import detail_levels, quick
+from sparklod_cli.lod import parts, quick
 from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.system.errors import FormatError
 from tests.inspection.streamed_sog_files import COUNTS, Folder, Node, folder, regions, splats
@@ -219,7 +219,7 @@ def test_sound_folders_have_no_findings(sound: Folder, tmp_path: Path) -> None:
 def test_what_we_write_has_no_findings(tmp_path: Path) -> None:
     """Neither as Streamed SOG, whose codes move splats within their bounds and out of their order, nor as SOG."""
     settings = DetailSettings((0.3, 0.1), chunk_splats=2_000, extent=2, min_splats=100)
-    scene = detail_levels.make(*quick.build(random_splats(3_000, sh_degree=0)), settings)
+    scene = parts.make_levels(*quick.build(random_splats(3_000, sh_degree=0)), settings)
     errors = np.arange(3) * np.ones((scene.regions, 1))
     scene = replace(scene, errors=errors, environment=random_splats(50, sh_degree=0, seed=1))
     path = tmp_path / "lod-meta.json"

@@ -21,7 +21,7 @@ from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.part_settings import TileSettings
-from sparklod_cli.lod.tiles import make
+from sparklod_cli.lod.parts import make_tiles
 from sparklod_cli.model.scene import Scene
 from tests.codecs.cases import linear
 from tests.conftest import FIXTURES
@@ -205,7 +205,9 @@ def test_the_golden_file_has_no_findings() -> None:
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("up", [None, "y", "-y", "z"])
 def test_what_we_write_has_no_findings(up: str | None, profile: str, tmp_path: Path) -> None:
-    made = make(*quality.build(random_splats(2_000, sh_degree=1), 2.0), TileSettings(tile_splats=60, lat=-33, lon=151))
+    made = make_tiles(
+        *quality.build(random_splats(2_000, sh_degree=1), 2.0), TileSettings(tile_splats=60, lat=-33, lon=151)
+    )
     made = dataclasses.replace(made, up=up)
     path = tmp_path / "tileset.json"
     files = codec.encode_files(made, WriteOptions(glb_profile=profile), most_tiles=40)

@@ -11,20 +11,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod import quality, quick
-from sparklod_cli.lod.detail_levels import (
+from sparklod_cli.lod.kernels.tree_links import find_parents
+from sparklod_cli.lod.part_settings import DetailSettings
+from sparklod_cli.lod.parts import (
     COARSE_ENOUGH,
     SIBLINGS,
     STEP,
     detail_cuts,
     losses,
-    make,
+    make_levels,
     owners_of,
     picture_errors,
     shares_of,
     with_plain_opacity,
 )
-from sparklod_cli.lod.kernels.tree_links import find_parents
-from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.gaussian import covariance, spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -100,7 +100,7 @@ def test_regions_stand_for_the_same_leaves_at_every_level() -> None:
     under = leaves_under(tree)
     of_row = {row.tobytes(): node for node, row in enumerate(nodes.center)}
     assert len(of_row) == len(nodes)
-    made = make(nodes, tree, DetailSettings(SHARES, chunk_splats=700, min_splats=100))
+    made = make_levels(nodes, tree, DetailSettings(SHARES, chunk_splats=700, min_splats=100))
     assert made.regions > 8 and made.counts.sum(axis=1).max() <= 700
     seen: set[int] = set()
     for region in range(made.regions):
@@ -119,7 +119,7 @@ def test_regions_stand_for_the_same_leaves_at_every_level() -> None:
 def test_any_scene_has_detail_levels(count: int, seed: int, chunk: int, extent: float, least: int) -> None:
     splats = random_splats(count, seed=seed)
     nodes, tree = quick.build(splats) if seed % 2 else quality.build(splats)
-    check(splats, make(nodes, tree, DetailSettings(SHARES, chunk, extent, least)), SHARES)
+    check(splats, make_levels(nodes, tree, DetailSettings(SHARES, chunk, extent, least)), SHARES)
 
 
 @pytest.mark.parametrize("name", hard_cases())
@@ -127,7 +127,7 @@ def test_detail_levels_of_hard_scenes(name: str) -> None:
     splats = hard_cases()[name]
     nodes, tree = quality.build(splats)
     with np.errstate(over="ignore"):
-        check(splats, make(nodes, tree, DetailSettings(SHARES, 200, 1.0, 50)), SHARES)
+        check(splats, make_levels(nodes, tree, DetailSettings(SHARES, 200, 1.0, 50)), SHARES)
 
 
 @pytest.mark.parametrize("leaves", [1, 100, 4 * COARSE_ENOUGH, 4 * COARSE_ENOUGH + 4, 30_000_000])
@@ -248,7 +248,7 @@ def test_a_plain_splat_covers_as_much(opacity: float) -> None:
 
 def test_nothing_depends_on_the_run() -> None:
     nodes, tree = quality.build(random_splats(1_000, sh_degree=1, seed=8))
-    first, second = (make(nodes, tree, DetailSettings(SHARES, 300)) for _ in range(2))
+    first, second = (make_levels(nodes, tree, DetailSettings(SHARES, 300)) for _ in range(2))
     for name in COLUMNS:
         assert getattr(first.splats, name).tobytes() == getattr(second.splats, name).tobytes()
     assert first.counts.tolist() == second.counts.tolist() and first.children.tolist() == second.children.tolist()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.io.reading import read_scene
-from sparklod_cli.lod import quality, tiles
+from sparklod_cli.lod import parts, quality
 from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.traversed import TileScene
@@ -30,7 +30,9 @@ Mask = NDArray[np.bool_]
 @pytest.fixture(scope="module")
 def scene() -> TileScene:
     """The demo scene in tiles of three levels."""
-    return tiles.make(*quality.build(read_scene(FIXTURES / "demo.ply").splats, 1.4), TileSettings(tile_splats=3000))
+    return parts.make_tiles(
+        *quality.build(read_scene(FIXTURES / "demo.ply").splats, 1.4), TileSettings(tile_splats=3000)
+    )
 
 
 def camera(seed: int, away: float) -> Camera:

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sparklod_cli.lod import quality, quick
-from sparklod_cli.lod.detail_levels import RefinementOrder, extents, with_plain_opacity
 from sparklod_cli.lod.part_settings import TileSettings
-from sparklod_cli.lod.tiles import PIXEL_ERROR, make, tile_cuts
+from sparklod_cli.lod.parts import PIXEL_ERROR, RefinementOrder, extents, make_tiles, tile_cuts, with_plain_opacity
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
@@ -59,7 +58,7 @@ def check(nodes: Splats, tree: LodTree, made: TileScene, tile_splats: int) -> No
 def test_children_stand_for_the_same_leaves_and_every_level_is_a_cut(growth: float, tile_splats: int) -> None:
     nodes, tree = quality.build(random_splats(400, seed=tile_splats), growth)
     under = leaves_under(tree)
-    made = make(numbered(nodes), tree, TileSettings(tile_splats=tile_splats))
+    made = make_tiles(numbered(nodes), tree, TileSettings(tile_splats=tile_splats))
     check(numbered(nodes), tree, made, tile_splats)
 
     def stands_for(tiles: NDArray[np.int64]) -> list[int]:
@@ -80,14 +79,14 @@ def test_children_stand_for_the_same_leaves_and_every_level_is_a_cut(growth: flo
 def test_hard_cases_have_tiles(name: str) -> None:
     splats = hard_cases()[name]
     nodes, tree = quick.build(splats)
-    check(nodes, tree, make(nodes, tree, TileSettings(tile_splats=20)), 20)
+    check(nodes, tree, make_tiles(nodes, tree, TileSettings(tile_splats=20)), 20)
 
 
 @settings(max_examples=25)
 @given(st.integers(1, 300), st.integers(1, 400), st.integers(0, 99))
 def test_scenes_of_any_size_have_tiles_of_any_size(count: int, tile_splats: int, seed: int) -> None:
     nodes, tree = quick.build(random_splats(count, seed=seed))
-    made = make(nodes, tree, TileSettings(tile_splats=tile_splats))
+    made = make_tiles(nodes, tree, TileSettings(tile_splats=tile_splats))
     check(nodes, tree, made, tile_splats)
     assert (made.tiles == 1) == (count <= tile_splats)
 
@@ -97,7 +96,7 @@ def test_tiles_do_not_depend_on_the_number_of_threads() -> None:
     first, second = (None, None)
     for threads in (1, 4):
         with on_threads(threads):
-            first, second = make(nodes, tree, TileSettings(tile_splats=200)), first
+            first, second = make_tiles(nodes, tree, TileSettings(tile_splats=200)), first
     assert first is not None and second is not None
     for name in ("parent", "level", "counts", "errors", "bounds"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
@@ -107,7 +106,7 @@ def test_tiles_do_not_depend_on_the_number_of_threads() -> None:
 
 def test_the_error_is_that_of_the_splats_that_are_refined() -> None:
     nodes, tree = quality.build(random_splats(2_000), 2.0)
-    made = make(numbered(nodes), tree, TileSettings(tile_splats=150))
+    made = make_tiles(numbered(nodes), tree, TileSettings(tile_splats=150))
     deepest = [tile for tile in np.flatnonzero(~made.is_leaf) if made.is_leaf[made.parent == tile].all()]
     assert deepest
     for tile in deepest:
@@ -118,7 +117,7 @@ def test_the_error_is_that_of_the_splats_that_are_refined() -> None:
 
 def test_tiles_are_as_full_as_their_number_allows() -> None:
     nodes, tree = quality.build(random_splats(5_000), 2.0)
-    made = make(nodes, tree, TileSettings(tile_splats=300))
+    made = make_tiles(nodes, tree, TileSettings(tile_splats=300))
     for tile in np.flatnonzero(~made.is_leaf):
         counts = made.counts[made.parent == tile]
         assert len(counts) == -(-counts.sum() // 300) and np.ptp(counts) <= len(counts)

@@ -21,7 +21,7 @@ from sparklod_cli.codecs.tiles_3d.tileset import LARGEST
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.part_settings import TileSettings
-from sparklod_cli.lod.tiles import make
+from sparklod_cli.lod.parts import make_tiles
 from sparklod_cli.model.scene import AXES, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
@@ -39,7 +39,9 @@ Files = dict[str, bytes]
 @functools.cache
 def tiles(up: str | None = None) -> TileScene:
     """Three levels of tiles."""
-    made = make(*quality.build(random_splats(1_500, sh_degree=1), 2.0), TileSettings(tile_splats=100, lat=47, lon=8))
+    made = make_tiles(
+        *quality.build(random_splats(1_500, sh_degree=1), 2.0), TileSettings(tile_splats=100, lat=47, lon=8)
+    )
     return dataclasses.replace(made, up=up)
 
 
@@ -153,7 +155,7 @@ def test_the_bytes_are_the_same_for_any_number_of_threads() -> None:
 
 
 def test_subtrees_of_many_tiles_are_nested_tilesets() -> None:
-    made = make(*quality.build(random_splats(3_000, sh_degree=0), 2.0), TileSettings(tile_splats=20))
+    made = make_tiles(*quality.build(random_splats(3_000, sh_degree=0), 2.0), TileSettings(tile_splats=20))
     whole, nested = files_of(made, "khronos"), files_of(made, "khronos", most_tiles=60)
     inner = [name for name in nested if name.startswith("tiles/") and name.endswith(".json")]
     assert len(inner) > 2 and set(nested) - set(inner) == set(whole)

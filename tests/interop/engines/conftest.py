@@ -20,7 +20,7 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.io.writing import parts_output
-from sparklod_cli.lod import detail_levels, quality
+from sparklod_cli.lod import parts, quality
 from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.model.traversed import DetailScene
@@ -104,7 +104,7 @@ DETAIL = DetailSettings((0.25, 0.05), chunk_splats=8_000, extent=4, min_splats=2
 @functools.cache
 def detailed() -> DetailScene:
     """Return the demo scene at several detail levels, which notes the axis that points up."""
-    scene = detail_levels.make(*quality.build(read_scene(FIXTURES / "demo.ply").splats, 2.0), DETAIL)
+    scene = parts.make_levels(*quality.build(read_scene(FIXTURES / "demo.ply").splats, 2.0), DETAIL)
     return dataclasses.replace(scene, up="-y")
 
 

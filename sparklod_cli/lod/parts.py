@@ -1,10 +1,18 @@
-"""Detail levels of a tree: cuts of it that do not depend on a camera, region by region, in plain splats.
+"""What trees are divided into for viewers other than Spark: the detail levels of Streamed SOG, the tiles of 3D Tiles.
+
+Detail levels are cuts of a tree that do not depend on a camera, region by region. Tiles are cuts that refine one
+another, divided in space. Both have plain splats.
 
 Splats of an opacity above 1 become ones of opacity 1, for formats that hold no more. A splat of linear opacity A > 1
 has the alpha p(z) = 1 - (1 - exp(-z^2 / 2)) ** A, flat on top. A plain Gaussian of opacity 1 and k times the scale has
 g(z) = exp(-z^2 / (2 k^2)). Both are isotropic on the screen, in standard deviations of the splat, so k depends on A
 alone. It is the one that covers as much: the integral of p over the plane is 2 pi H(A), with the harmonic number H (see
 `model/falloff.py`), that of g is 2 pi k^2, so k = sqrt(H(A)).
+
+The geometric error of a tile is `PIXEL_ERROR` times the median feature size of those of its splats that its children
+replace. A viewer such as CesiumJS refines a tile where its error, projected, is larger than 16 pixels by default: where
+half of these splats are larger than a pixel. That is the rule by which Spark refines a node (see `traversal`), for a
+tile as a whole. See docs/decisions/21-3d-tiles.md.
 """
 
 from __future__ import annotations
@@ -19,11 +27,11 @@ from ..model.falloff import harmonic
 from ..model.gaussian import covariance, rotation_matrices, spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
-from ..model.traversed import DetailScene
+from ..model.traversed import DetailScene, TileScene
 from ..system.errors import InvalidSplatsError
 from ..system.progress import Progress, silent
 from .kernels.tree_links import find_parents
-from .part_settings import DetailSettings
+from .part_settings import DetailSettings, TileSettings
 
 #: Half a bound's side for one splat, in standard deviations. Tools bound a splat by the box of one standard deviation
 #: along its own axes, rotated; no multiple of the ellipsoid's box below sqrt(3) encloses that box however it is turned.
@@ -40,6 +48,7 @@ STEP = 0.25
 #: Without given shares, levels are added until one has no more splats than this: what a viewer loads first, and draws
 #: at least. Chosen.
 COARSE_ENOUGH = 1 << 16
+
 #: Rows and columns, among xx xy xz yy yz zz, of the covariance on the planes xy, xz and yz, and the axes of these.
 PLANES = ((0, 3, 1, 0, 1), (0, 5, 2, 0, 2), (3, 5, 4, 1, 2))
 
@@ -63,7 +72,7 @@ Column = NDArray[np.float64]
 Boxes = NDArray[np.float64]
 
 
-def make(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progress: Progress = silent) -> DetailScene:
+def make_levels(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progress: Progress = silent) -> DetailScene:
     """Return the detail levels of a scene, from its tree.
 
     Level 0 has the leaves, bit for bit if their opacity is at most 1. Each further level is a cut of the tree that the
@@ -344,3 +353,97 @@ def beyond(splats: Splats, radius: float) -> NDArray[np.bool_]:
             "give --environment-beyond a larger radius"
         )
     return far
+
+
+#: Geometric error of a splat in its feature sizes: pixels of error that CesiumJS allows by default
+#: (`maximumScreenSpaceError`), so that a splat is refined where it is larger than a pixel.
+PIXEL_ERROR = 16.0
+
+#: Least geometric error of a tile that has children, as a share of the diagonal of its box: one of 0 is never refined.
+#: A millionth of what fills a screen is no pixel of any. Chosen.
+LEAST_ERROR = 1e-6
+
+
+def make_tiles(nodes: Splats, tree: LodTree, settings: TileSettings, *, progress: Progress = silent) -> TileScene:
+    """Return the tiles of a scene, from its tree.
+
+    Tiles without children have the leaves, bit for bit if their opacity is at most 1. Every level is a cut of the tree
+    of about a quarter of the splats of the next finer one, up to the root tile, whose cut is one tile. The children of
+    a tile have the nodes of a finer cut that are below those of the tile, or are those: no splat is lost or doubled.
+    The result does not depend on the number of threads.
+    Tiles are in the order of their levels; within a tile, splats are in the order of the tree.
+    """
+    order = RefinementOrder(nodes, tree)
+    cuts = tile_cuts(order, settings.tile_splats)
+    members: list[Nodes] = [cuts[0]]
+    parent, level = [-1], [0]
+    tile = np.full(len(nodes), -1, np.int64)  # of the nodes of the cut that was last divided
+    tile[cuts[0]] = 0
+    for number in range(1, len(cuts)):
+        progress("dividing", number, len(cuts), "level")
+        cut, above = cuts[number], cuts[number - 1]
+        owner = above[owners_of(order.parent, above)[cut]]
+        held = tile[owner]
+        refined = np.unique(held[owner != cut])
+        held_in_order = np.argsort(held, kind="stable")
+        starts = np.searchsorted(held[held_in_order], np.stack([refined, refined + 1]))
+        tile[cut] = held
+        for each, start, stop in zip(refined.tolist(), *starts.tolist(), strict=True):
+            below = cut[held_in_order[start:stop]]
+            for group in _groups(below, nodes.center, -(-len(below) // settings.tile_splats)):
+                tile[group] = len(members)
+                members.append(group)
+                parent.append(each)
+                level.append(number)
+    progress("dividing", len(cuts), len(cuts), "level")
+    return _measured(nodes, tree, members, np.array(parent, np.int32), np.array(level, np.int32), settings)
+
+
+def tile_cuts(order: RefinementOrder, tile_splats: int) -> list[Nodes]:
+    """Return cuts, the coarsest, of at most `tile_splats`, first; each has `STEP` of the splats of the next one."""
+    counts = [order.leaves]
+    while counts[-1] > tile_splats:
+        counts.append(round(counts[-1] * STEP))
+    return [order.cut(count) for count in reversed(counts)]
+
+
+def _groups(some: Nodes, center: FloatArray, count: int) -> list[Nodes]:
+    """Divide nodes into `count` ascending groups of about one size, recursively along the longest side."""
+    if count < 2:
+        return [np.sort(some)]
+    where = center[some]
+    axis = int(np.argmax(np.ptp(where.astype(np.float64), axis=0)))
+    order = np.argsort(where[:, axis], kind="stable")
+    first = count // 2
+    at = len(some) * first // count
+    return _groups(some[order[:at]], center, first) + _groups(some[order[at:]], center, count - first)
+
+
+def _measured(
+    nodes: Splats,
+    tree: LodTree,
+    members: list[Nodes],
+    parent: NDArray[np.int32],
+    level: NDArray[np.int32],
+    settings: TileSettings,
+) -> TileScene:
+    """Return tiles with their splats, bounds and errors."""
+    counts = np.array([len(each) for each in members], np.int64)
+    index, number = np.concatenate(members), np.repeat(np.arange(len(members)), counts)
+    splats = with_plain_opacity(nodes.take(index))
+    bounds = united(extents(splats), number, len(members))
+    size, merged = spark_size(splats).astype(np.float64), ~tree.is_leaf[index]
+    errors, stop = np.zeros(len(members)), np.cumsum(counts)
+    for tile in reversed(range(len(members))):  # children come after their parents
+        part = slice(stop[tile] - counts[tile], stop[tile])
+        if merged[part].any():
+            diagonal = float(np.linalg.norm(bounds[tile, 1] - bounds[tile, 0]))
+            own = PIXEL_ERROR * float(np.median(size[part][merged[part]]))
+            errors[tile] = max(errors[tile], own, LEAST_ERROR * diagonal, float(np.finfo(np.float32).tiny))
+        if tile:
+            above = parent[tile]
+            errors[above] = max(errors[above], errors[tile])
+            bounds[above, 0] = np.minimum(bounds[above, 0], bounds[tile, 0])
+            bounds[above, 1] = np.maximum(bounds[above, 1], bounds[tile, 1])
+    transform = np.array(settings.matrix).reshape(4, 4).T
+    return TileScene(splats, parent, level, counts, errors, bounds, transform=transform)
