@@ -1,4 +1,4 @@
-"""What trees are divided into for viewers other than Spark: the detail levels of Streamed SOG, the tiles of 3D Tiles.
+"""Detail levels of a tree, for Streamed SOG, and its tiles, for 3D Tiles.
 
 Detail levels are cuts of a tree that do not depend on a camera, region by region. Tiles are cuts that refine one
 another, divided in space. Both have plain splats.

@@ -189,39 +189,25 @@ def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) 
     counts = [loaded.leaf_count for loaded in scenes]
     while True:
         every = max(sum(counts) // SAMPLE, 1)
-        starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        samples = [_Sample(int(start), every) for start in starts[:-1]]
+        starts = np.concatenate([[0], np.cumsum(counts)]).tolist()
+        parts: list[list[Balls]] = [[] for _ in scenes]
+        found, largest = [0] * len(scenes), 0.0
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for loaded in dict.fromkeys(scenes):
             of_loaded = [at for at, each in enumerate(scenes) if each is loaded]
-            for splats, leaves in _leaves_of(loaded):
-                for at in of_loaded:
-                    samples[at].add(balls_of(splats, leaves, instances[at].object_to_world))
-        found = [sample.count for sample in samples]
+            for (splats, leaves), at in ((each, at) for each in _leaves_of(loaded) for at in of_loaded):
+                balls = balls_of(splats, leaves, instances[at].object_to_world)
+                some = slice(-(starts[at] + found[at]) % every, None, every)
+                parts[at].append(Balls(balls.center[some].copy(), balls.radius[some].copy()))
+                found[at] += len(balls.radius)
+                largest = max(largest, float(balls.radius.max(initial=0)))
+                low = np.minimum(low, balls.center.min(axis=0, initial=np.inf))
+                high = np.maximum(high, balls.center.max(axis=0, initial=-np.inf))
         if found == counts:
             break
         counts = found  # some are not finite, and do not count
-    whole = Balls.concat(part for sample in samples for part in sample.parts)
-    low = np.min([sample.low for sample in samples], axis=0)
-    high = np.max([sample.high for sample in samples], axis=0)
-    return Balls(whole.center, whole.radius, np.stack([low, high]), max(sample.largest for sample in samples))
-
-
-class _Sample:
-    """Every n-th ball of an instance, and the bounds of all of them; the first one has the number `start` of all."""
-
-    def __init__(self, start: int, every: int) -> None:
-        self._start, self._every = start, every
-        self.count, self.largest = 0, 0.0
-        self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
-        self.parts: list[Balls] = [Balls(np.empty((0, 3)), np.empty(0))]
-
-    def add(self, balls: Balls) -> None:
-        first = -(self._start + self.count) % self._every
-        self.parts.append(Balls(balls.center[first :: self._every].copy(), balls.radius[first :: self._every].copy()))
-        self.count += len(balls.radius)
-        self.largest = max(self.largest, float(balls.radius.max(initial=0)))
-        self.low = np.minimum(self.low, balls.center.min(axis=0, initial=np.inf))
-        self.high = np.maximum(self.high, balls.center.max(axis=0, initial=-np.inf))
+    whole = Balls.concat([Balls(np.empty((0, 3)), np.empty(0)), *itertools.chain.from_iterable(parts)])
+    return Balls(whole.center, whole.radius, np.stack([low, high]), largest)
 
 
 def _leaves_of(loaded: LoadedScene) -> Iterator[tuple[Splats, Index]]:

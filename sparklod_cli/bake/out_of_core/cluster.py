@@ -226,18 +226,19 @@ class ClusterEngine:
         with Pool(self, stage) as pool:
             for place, each in enumerate(arguments):
                 pool.submit(str(place), place, functools.partial(call, threads=self.threads), *each)
-            yield self._outcomes(pool, stage, len(arguments), progress, unit)
 
-    def _outcomes(self, pool: Pool, stage: str, count: int, progress: Progress, unit: str) -> Iterator[Any]:
-        outcomes = dict[str, Any]()
-        for place in range(count):
-            while str(place) not in outcomes:
-                progress(stage, place + len(outcomes), count, unit)
-                name, result, error = pool.next()
-                if error is not None and not isinstance(error, SparklodError):
-                    raise error
-                outcomes[name] = result if error is None else error
-            yield outcomes.pop(str(place))
+            def outcomes() -> Iterator[Any]:
+                ended = dict[str, Any]()
+                for place in range(len(arguments)):
+                    while str(place) not in ended:
+                        progress(stage, place + len(ended), len(arguments), unit)
+                        name, result, error = pool.next()
+                        if error is not None and not isinstance(error, SparklodError):
+                            raise error
+                        ended[name] = result if error is None else error
+                    yield ended.pop(str(place))
+
+            yield outcomes()
 
     def check(self, store: Store | None, files: Sequence[Place] = ()) -> None:
         """Raise a `SparklodError` if a worker has another sparklod, or does not see the store or the files.
@@ -331,18 +332,12 @@ class Pool:
                 del self._calls[name]
                 return name, result, None
             error = self._engine.failure(name, future)
-            if not self._is_worth_another(name, error):
+            tried = self._tries.get(name, 0)
+            if not isinstance(error, OSError) or error.errno in LASTING or tried >= len(PAUSES):
                 del self._calls[name]
                 return name, None, error
-
-    def _is_worth_another(self, name: str, error: Exception) -> bool:
-        """Return whether a failed call is repeated; it is, after a pause."""
-        tried = self._tries.get(name, 0)
-        if not isinstance(error, OSError) or error.errno in LASTING or tried >= len(PAUSES):
-            return False
-        self._tries[name] = tried + 1
-        self._paused.append((time.monotonic() + PAUSES[tried], name))
-        return True
+            self._tries[name] = tried + 1
+            self._paused.append((time.monotonic() + PAUSES[tried], name))
 
 
 #: Result of a probe, and its array.
