@@ -356,7 +356,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
         lod, render = options.cut.settings(), look.settings(console.say)
         # What looks at more than cuts is read whole.
         paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
-        scenes = scenes_of(options, instances, console, through=look.through, paged=paged)
+        scenes = scenes_of(options.cut, options.general, instances, console, through=look.through, paged=paged)
         path, diff = options.cameras.path(scenes), options.diff
         render = with_planes(ctx, options.cameras, render, path, scenes)
         output, settings = _place(ctx, options, instances, path)
@@ -371,7 +371,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
             output,
             settings,
             loading=None if options.after is None else (options.streaming, options.after),
-            reference=None if diff is None else scenes_of(options, instances_of([diff]), console),
+            reference=None if diff is None else scenes_of(options.cut, options.general, instances_of([diff]), console),
             overwrite=options.overwrite,
             progress=console.progress,
         )
@@ -517,7 +517,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
         if options.plot is not None:
             check_chart(options.plot, overwrite=overwrite)
         render = dataclasses.replace(options.appearance.settings(console.say), max_sh=options.max_sh)
-        scenes = scenes_of(options, instances, console, trees_only=True)
+        scenes = scenes_of(options.cut, options.general, instances, console, trees_only=True)
         path = options.cameras.path(scenes)
         check_view(ctx, console, options.cameras, path, scenes())
         render = with_planes(ctx, options.cameras, render, path, scenes)

@@ -156,7 +156,9 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         screen = outputs.table.path is None and outputs.table.form is not None and is_terminal(sys.stdout)
         outputs.check()
         columns = TRAVERSED if outputs.plot is None else COLUMNS
-        scenes = scenes_of(options, instances, console, columns=columns, trees_only=True, paged=True)
+        scenes = scenes_of(
+            options.cut, options.general, instances, console, columns=columns, trees_only=True, paged=True
+        )
         path = options.cameras.path(scenes)
         check_view(ctx, console, options.cameras, path, scenes(), options.streaming.network)
         keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})

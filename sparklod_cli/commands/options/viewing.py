@@ -23,7 +23,7 @@ from ...system.untrusted import printable
 from ...viewers.viewer_settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS, DetailRule, LodSettings, Network
 from ..command import COMMON, DIRECTION, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, parameters_of, refuse
 from ..paths import NamedPath, file_of
-from .common import DEFAULT_UP, UP
+from .common import DEFAULT_UP, UP, General
 
 if TYPE_CHECKING:
     from ...cameras.camera import Matrix
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from ...render.settings import RenderSettings
     from ...viewers.scenes import Scenes
     from ..console import Console
-    from ..render import RenderOptions
-    from ..traverse import TraverseOptions
 
 #: The options that are each a source of cameras, of which one can be given.
 SOURCES = ("camera_path", "orbit", "dolly", "look_at", "keyframes", "views")
@@ -341,12 +339,12 @@ class CutOptions:
 
 
 def scenes_of(
-    options: RenderOptions | TraverseOptions, instances: Sequence[Instance], console: Console, **how: Any
+    cut: CutOptions, general: General, instances: Sequence[Instance], console: Console, **how: Any
 ) -> Callable[[], Scenes]:
     """Return a function that reads the scenes of instances when it is first called; `how` are further arguments."""
     from ...viewers.scenes import read_scenes
 
-    how |= {"precision": options.cut.precision, "threads": options.general.threads, "progress": console.progress}
+    how |= {"precision": cut.precision, "threads": general.threads, "progress": console.progress}
     return functools.cache(functools.partial(read_scenes, instances, **how))
 
 
