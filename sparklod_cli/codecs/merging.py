@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import bisect
 import contextlib
-import itertools
 import posixpath
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -39,7 +37,6 @@ def merged(parts: Sequence[Placed]) -> Reader:
     The result is antialiased if most of the splats are, and a note says where they differ. It has an up axis if all
     scenes have the same. Errors name the scene.
     """
-    firsts = tuple(itertools.accumulate((part.reader.count for part in parts), initial=0))
     degree = max(part.reader.sh_degree for part in parts)
     antialiased, notes = _antialiased(parts)
     notes += tuple(f"{part.name}: {note}" for part in parts for note in part.reader.notes)
@@ -47,10 +44,10 @@ def merged(parts: Sequence[Placed]) -> Reader:
     if len(set(axes)) > 1:
         notes += (f"{differing(axes)}, so none is noted unless --up names it",)
     return Reader(
-        firsts[-1],
+        sum(part.reader.count for part in parts),
         degree,
         " and ".join(sorted({part.reader.format for part in parts})),
-        _FillMerged(tuple(parts), firsts),
+        _FillMerged(tuple(parts)),
         antialiased,
         tuple(dict.fromkeys(notes)),
         up=common_axis(axes),
@@ -77,44 +74,34 @@ class _FillMerged:
     """`Reader.fill` of several scenes, in the memory of a block; can be pickled if their readers can."""
 
     parts: tuple[Placed, ...]
-    firsts: tuple[int, ...]
 
     def __call__(self, target: Target, threads: int, progress: Progress) -> None:
-        start, number = target.start, bisect.bisect_right(self.firsts, target.start) - 1
-        while start < target.stop:
-            part, first, stop = self.parts[number], self.firsts[number], min(self.firsts[number + 1], target.stop)
+        done = 0
+        for number, rows, out in target.shares(part.reader.count for part in self.parts):
+            part, at = self.parts[number], 0
             with naming(part.name):
-                for splats in part.reader.blocks(start - first, stop - first):
-                    rows = target.rows(slice(start, start := start + len(splats)))
-                    copy_rows(part.transform.apply(splats), rows)
-                    progress("reading", start - target.start, len(target.splats), "splat")
-            number += 1
+                for splats in part.reader.blocks(rows.start, rows.stop):
+                    copy_rows(part.transform.apply(splats), out.take(slice(at, at := at + len(splats))))
+                    done += len(splats)
+                    progress("reading", done, len(target.splats), "splat")
 
 
 #: Run of splats of a file: the first, their number, and the row that the first of them gets.
 Piece = tuple[int, int, int]
 
 
-@dataclass(frozen=True)
-class Chunk:
-    """Facts in the header of a splat file that a manifest names, and the pieces of it to read.
+@dataclass(frozen=True, eq=False)
+class Chunk(Reader):
+    """A splat file that a manifest names, which is opened for each read, and the pieces of it to read.
 
     Attributes:
         name: path relative to the manifest's folder.
-        count: all its splats.
         bytes: of the file and the files that it names.
     """
 
-    name: str
-    count: int
-    sh_degree: int
-    antialiased: bool
-    bytes: int
-    pieces: tuple[Piece, ...]
-    up: str | None = None
-    format: str = ""
-    notes: tuple[str, ...] = ()
-    up_by: str = ""
+    name: str = ""
+    bytes: int = 0
+    pieces: tuple[Piece, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -142,18 +129,18 @@ class SceneFiles:
         """Read the header of a file, which errors name; its pieces are those to read later, None for all of it."""
         with self._opened(name) as source:
             content = self.open_content(name, source)
-        return Chunk(
-            name,
-            content.count,
-            content.sh_degree,
-            content.antialiased,
-            content.header.get("bytes", source.size),
-            ((0, content.count, row),) if pieces is None else tuple(pieces),
-            content.up,
-            content.format,
-            content.notes,
-            content.up_by,
-        )
+        facts, expected = vars(content), (content.count, content.sh_degree)
+        size = content.header.get("bytes", source.size)
+        pieces = ((0, content.count, row),) if pieces is None else tuple(pieces)
+
+        def fill(target: Target, threads: int, progress: Progress) -> None:
+            with self._opened(name) as source:
+                content = self.open_content(name, source)
+                if (content.count, content.sh_degree) != expected:
+                    raise FormatError("it was changed while it was read; start again")
+                content.fill(target, threads, progress)
+
+        return Chunk(**facts | {"fill": fill, "coding": None}, name=name, bytes=size, pieces=pieces)
 
     def read(
         self,
@@ -170,11 +157,7 @@ class SceneFiles:
         together = min(threads, len(chunks))
 
         def work(chunk: Chunk) -> int:
-            with self._opened(chunk.name) as source:
-                reader = replace(self.open_content(chunk.name, source), threads=max(1, threads // together))
-                splats, _ = reader.read(0, reader.count, once=True)
-            if (reader.count, reader.sh_degree) != (chunk.count, chunk.sh_degree):
-                raise FormatError(f"{quoted_value(chunk.name)} was changed while it was read; start again")
+            splats, _ = replace(chunk, threads=max(1, threads // together)).read(0, chunk.count, once=True)
             for start, count, row in chunk.pieces:
                 rows = slice(row - first_row, row - first_row + count)
                 copy_rows(splats.take(slice(start, start + count)), out.take(rows))
@@ -192,25 +175,20 @@ class SceneFiles:
             chunks: in the order of the rows of their pieces, where these are read in blocks.
         """
         count = sum(chunk.rows for chunk in chunks)
-        last: dict[int, Splats] = {}  # of the file that was read last, by its first row
+        last: dict[int, Splats] = {}  # of the file that was read last, by its number
 
         def fill(target: Target, threads: int, progress: Progress) -> None:
             if len(target.splats) == count:
                 self.read(chunks, target.splats, threads, progress)
                 return
-            end = 0
-            for chunk in chunks:
-                begin, end = end, end + chunk.rows
-                start, stop = max(target.start, begin), min(target.stop, end)
-                if start >= stop:
-                    continue
-                if begin not in last:
+            for number, rows, out in target.shares(chunk.rows for chunk in chunks):
+                if number not in last:
                     last.clear()
+                    chunk = chunks[number]
                     splats = Splats.empty(chunk.rows, degree)
-                    self.read([chunk], splats, threads, first_row=begin)
-                    last[begin] = splats
-                part = last[begin].take(slice(start - begin, stop - begin))
-                copy_rows(part, target.rows(slice(start, stop)))
+                    self.read([chunk], splats, threads, first_row=chunk.pieces[0][2])
+                    last[number] = splats
+                copy_rows(last[number].take(rows), out)
             if target.stop == count:
                 last.clear()
 

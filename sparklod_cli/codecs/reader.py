@@ -151,6 +151,15 @@ class Target:
         """Return views of rows, which are counted as those of the file."""
         return self.splats.take(slice(part.start - self.start, part.stop - self.start))
 
+    def shares(self, counts: Iterable[int]) -> Iterator[tuple[int, slice, Splats]]:
+        """Yield the files, of these counts one after the other, that have rows of these: number, rows and views."""
+        end = 0
+        for number, count in enumerate(counts):
+            begin, end = end, end + count
+            start, stop = max(self.start, begin), min(self.stop, end)
+            if start < stop:
+                yield number, slice(start - begin, stop - begin), self.rows(slice(start, stop))
+
     def nodes(self, part: slice) -> LodTree | None:
         """Return views of nodes, counted as `rows`."""
         return None if self.tree is None else self.tree.rows(slice(part.start - self.start, part.stop - self.start))

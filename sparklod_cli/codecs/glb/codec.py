@@ -288,18 +288,15 @@ def _joined(contents: Sequence[Reader]) -> Reader:
     degree = max(content.sh_degree for content in contents)
 
     def fill(target: Target, threads: int, progress: Progress) -> None:
-        end = 0
-        for content in contents:
-            begin, end = end, end + content.count
-            start, stop = max(target.start, begin), min(target.stop, end)
-            if start >= stop:
-                continue
-            rows = target.rows(slice(start, stop))
-            own = rows if content.sh_degree == degree else Splats.empty(stop - start, content.sh_degree)
-            content.fill(Target(own, start - begin, columns=target.columns), threads, silent)
+        done = 0
+        for number, part, rows in target.shares(content.count for content in contents):
+            content = contents[number]
+            own = rows if content.sh_degree == degree else Splats.empty(len(rows), content.sh_degree)
+            content.fill(Target(own, part.start, columns=target.columns), threads, silent)
             if own is not rows:
                 copy_rows(own, rows)
-            progress("reading", stop - target.start, len(target.splats), "splat")
+            done += len(rows)
+            progress("reading", done, len(target.splats), "splat")
 
     first, notes = contents[0], [note for content in contents for note in content.notes]
     antialiased = any(content.antialiased for content in contents)

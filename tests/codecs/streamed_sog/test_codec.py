@@ -284,7 +284,7 @@ def test_a_chunk_that_changes_meanwhile_is_refused() -> None:
         files = golden() if opened < 2 else golden() | {f"0_0/{each}": data for each, data in other.items()}
         return open_companion(files)(name)
 
-    with pytest.raises(FormatError, match=r"'0_0/meta.json' was changed while it was read; start again"):
+    with pytest.raises(FormatError, match=r"'0_0/meta.json': it was changed while it was read; start again"):
         decode_file(codec, io.BytesIO(golden()["lod-meta.json"]), open_companion=changing)
 
 
