@@ -76,9 +76,6 @@ def warm_up(*, processes: int, progress: Progress = silent) -> int:
 
     Args:
         processes: number of processes to compile in, since numba compiles one kernel at a time in each.
-
-    Raises:
-        SparklodError: no cache can be written, or a kernel cannot be compiled.
     """
     wanted = missing()
     if not wanted:

@@ -43,10 +43,6 @@ def draw_files(
         loading: how chunks get to the viewer, and the seconds since a visitor opened the page in front of each camera;
             None where every chunk is resident.
         reference: the scenes whose pictures are subtracted from these.
-
-    Raises:
-        UnfitError: the budget is too small for the roots.
-        SparklodError: a file cannot be read or written, or a picture cannot be drawn.
     """
     from ..images.sequence import write_pictures
 
@@ -88,10 +84,6 @@ def traverse_files(
 
     Returns:
         the summary of the frames, the outcomes of `asserts`, and what `simulation.frames.write_frames` returns besides.
-
-    Raises:
-        UnfitError: the budget, or the chunk cache, is too small for the roots.
-        SparklodError: a file cannot be written.
     """
     from ..simulation.frames import Simulation, write_frames
     from ..simulation.results import EMPTY, LOADING, summarize

@@ -110,8 +110,8 @@ def write(
         if not isinstance(value, (kind, NoneType)):
             raise TypeError(f"{name} is {value!r}; give {'a ' if name == 'ranges' else ''}{kind.__name__}")
     rad = dataclasses.replace(rad or RadOptions(), chunked=chunked or (rad is not None and rad.chunked))
-    options = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog or SogOptions())
-    options = options if glb_profile is None else dataclasses.replace(options, glb_profile=glb_profile)
+    sog = sog or SogOptions()
+    options = WriteOptions(spz_version, fractional_bits, compression_level, rad, sog, glb_profile=glb_profile)
     if not len(scene_like(scene).splats):
         raise InvalidSplatsError(f"{path}: the scene has no splats to write")
     with progress_callback(progress) as callback, memory_errors_translated():

@@ -83,11 +83,7 @@ def _program(shell: str) -> str:
 
 
 def _install(shell: str) -> None:
-    """Append the line that loads the script to the settings of a shell, unless they have it.
-
-    Raises:
-        SparklodError: the file cannot be read or written; names it.
-    """
+    """Append the line that loads the script to the settings of a shell, unless they have it."""
     variable, folder, name, line = SHELLS[shell]
     line = line.format(program=_program(shell))
     path = Path(os.environ.get(variable) or Path.home() / folder) / name

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 #: Options without an effect on some styles and backends.
 UNSTYLED = {"points": ("profile", "sort"), "billboards": ("profile", "sort"), "sorted-billboards": ("profile",)}
-UNKNOWN_TO = {"open3d": ("profile", "sort")}
+UNKNOWN_TO = {"osmesa": ("device",), "open3d": ("profile", "sort", "device")}
 
 #: The budgets to compare, unless others are given.
 DEFAULT_BUDGETS = "2%,5%,10%,25%,50%"
@@ -160,8 +160,6 @@ class Appearance:
             )
         refuse(ctx, UNSTYLED.get(render.style, ()), f"cannot be used with --style {render.style}")
         refuse(ctx, UNKNOWN_TO.get(render.backend, ()), f"cannot be used with --backend {render.backend}")
-        if render.backend != "numba":
-            refuse(ctx, ["device"], f"cannot be used with --backend {render.backend}")
         if render.color_by == "overdraw":
             refuse(
                 ctx,

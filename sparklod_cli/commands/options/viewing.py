@@ -53,16 +53,8 @@ ONLY_WITH = {
     "world_transform": ("camera_path", "look_at", "views", "keyframes"),
 }
 
-#: Options of the near and the far plane. Without them, the planes move apart, so that a view of the whole scene clips
-#: nothing.
-PLANES = ("near", "far")
-
 #: Characters of a --world-transform given as numbers; any other text names a file.
 NUMERIC = set("0123456789+-.,eE ")
-
-#: Durations in seconds, and frames per second.
-SECONDS, RATE = Range(above=0, most=1e6, unit="S"), Range(above=0, most=1e6, unit="N")
-
 
 #: Help and range of `--orbit`.
 AROUND_SCENE = "Place N cameras around the scene.  [default, without any source of cameras: "
@@ -129,10 +121,11 @@ class Cameras:
     seconds: float | None = setting(
         "Duration of --orbit, of --dolly, and of --keyframes from one view to the next, in seconds.  [default: 2; of"
         " --orbit, N frames at --fps]",
-        SECONDS,
+        Range(above=0, most=1e6, unit="S"),
     )
     fps: float | None = setting(
-        "Frames per second of the path; times are counted by it.  [default: the file's times, or 30]", RATE
+        "Frames per second of the path; times are counted by it.  [default: the file's times, or 30]",
+        Range(above=0, most=1e6, unit="N"),
     )
     every: int = setting("Take every K-th camera of the path.", whole(1, unit="K"), 1)
     views: tuple[Any, ...] = ()  # an option of pictures alone
@@ -398,9 +391,12 @@ def check_view(
 def with_planes(
     ctx: click.Context, cameras: Cameras, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]
 ) -> RenderSettings:
-    """Return settings whose near and far planes enclose the scenes, where the distance is chosen for them, too."""
+    """Return settings whose near and far planes enclose the scenes, where the distance is chosen for them, too.
+
+    So a view of the whole scene clips nothing. Planes that were given stay.
+    """
     fixed = cameras.distance is not None or any(getattr(cameras, name) for name in ONLY_WITH["world_transform"])
-    if fixed or any(is_set(ctx, name) for name in PLANES):
+    if fixed or any(is_set(ctx, name) for name in ("near", "far")):
         return render
     from ...cameras.framing import reach
 
