@@ -19,7 +19,6 @@ from ..system.threads import thread_count
 from .arguments import ProgressLike, progress_callback, scene_like
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from ..codecs.rad.codec import RadChunk

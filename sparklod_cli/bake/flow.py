@@ -155,12 +155,7 @@ def _digest(text: str) -> str:
 
 
 def _may_need_blocks(
-    header: Reader,
-    source: Source,
-    target: Place,
-    settings: BakeSettings,
-    resources: Resources,
-    engine: Engine | None,
+    header: Reader, source: Source, target: Place, settings: BakeSettings, resources: Resources, engine: Engine | None
 ) -> bool:
     """Return whether a bake goes out of core, or an interrupted one may have left a scratch folder."""
     files = settings.rgba or settings.environment or settings.camera_path  # a missing one is reported early

@@ -241,11 +241,7 @@ LOOKALIKES: tuple[tuple[str, bytes | None, tuple[str, ...]], ...] = (
     (_CAMERAS, None, ("camera_path",)),
     ("the manifest of an LCC scene; convert it to another format", None, ("totalLevel",)),
     # Longer than two bytes, as a .splat or .hier file may begin with any number.
-    (
-        "a JSON list; if it holds cameras, give it as --camera-path",
-        rb"(?:\xef\xbb\xbf)?\s*\[\s*\{\s*\"\w+\"\s*:",
-        (),
-    ),
+    ("a JSON list; if it holds cameras, give it as --camera-path", rb"(?:\xef\xbb\xbf)?\s*\[\s*\{\s*\"\w+\"\s*:", ()),
 )
 
 

@@ -143,12 +143,7 @@ class SceneFiles:
         return Chunk(**facts | {"fill": fill, "coding": None}, name=name, bytes=size, pieces=pieces)
 
     def read(
-        self,
-        chunks: Sequence[Chunk],
-        out: Splats,
-        threads: int = 1,
-        progress: Progress = silent,
-        first_row: int = 0,
+        self, chunks: Sequence[Chunk], out: Splats, threads: int = 1, progress: Progress = silent, first_row: int = 0
     ) -> None:
         """Fill all rows of `out`, the first of which is `first_row` of the pieces, several files at a time.
 

@@ -125,9 +125,7 @@ class RenderSettings(CheckedSettings):
         STYLES[0],
     )
     backend: str = setting(
-        "Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.",
-        BACKENDS,
-        BACKENDS[0],
+        "Renderer: numba is the reference, osmesa is OpenGL in software, open3d is a quick look.", BACKENDS, BACKENDS[0]
     )
     device: str = setting(DEVICE_HELP.format("the backend numba"), DEVICES, "cpu")
     color_by: str | None = setting(

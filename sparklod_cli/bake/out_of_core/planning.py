@@ -87,10 +87,7 @@ def blocks_for(
         f"{name}: goes out of core, as {why}; {count_of(splats, 'splat')} in blocks of up to"
         f" {block_splats:,}, scratch of about {format_size(scratch)} in {store}"
     )
-    with (
-        work(block_splats) as block_splats,
-        _opened(source, store.folder, threads, engine) as stream,
-    ):
+    with work(block_splats) as block_splats, _opened(source, store.folder, threads, engine) as stream:
         settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
         assert tree.form is not None  # others need the whole tree
         job = Job(store, stream, settings, tree.form.codec().needed(tree.options), tree.in_chunks)

@@ -30,15 +30,7 @@ from ..quantize import Bytes
 from ..reader import OpenFile, comment_of
 from ..spark_codings import SplatEncoding
 from .property_codings import BLOCK, BY_NAME, CODINGS, GZ, PROPERTIES, Property, Row, encodings_of
-from .rad_header import (
-    Files,
-    RadChunkHeader,
-    RadHeader,
-    in_files,
-    in_one_file,
-    pack_chunk_header,
-    padding,
-)
+from .rad_header import Files, RadChunkHeader, RadHeader, in_files, in_one_file, pack_chunk_header, padding
 from .rad_options import AUTOMATIC, code_range
 from .rad_options import held as held
 from .rad_options import needed as needed

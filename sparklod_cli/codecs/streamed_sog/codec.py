@@ -189,12 +189,7 @@ class ChunkPlan(NamedTuple):
 
 
 def encode_files(
-    scene: DetailScene,
-    options: WriteOptions,
-    settings: Divided,
-    *,
-    threads: int = 1,
-    progress: Progress = silent,
+    scene: DetailScene, options: WriteOptions, settings: Divided, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[tuple[str, Iterable[bytes]]]:
     """Return the files of a scene by name, which has a folder ("0_0/meta.json"); lod-meta.json comes last.
 

@@ -301,12 +301,7 @@ def _stands_for(tileset: Tileset, number: int) -> int:
 
 
 def scan_splats(
-    tileset: Tileset,
-    files: SceneFiles,
-    chunks: Mapping[int, Chunk],
-    *,
-    threads: int = 1,
-    progress: Progress = silent,
+    tileset: Tileset, files: SceneFiles, chunks: Mapping[int, Chunk], *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[RuleViolation]:
     """Yield the rules about splats that tiles, by number, break; see `SceneFiles.violations`."""
     volumes, numbers = volumes_of(tileset), {chunk.name: number for number, chunk in chunks.items()}
