@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparklod_cli.api import jobs
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import ROUND_TRIPS
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.images.output import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from sparklod_cli.viewers import scenes
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, floats, pixels, render
 from tests.conftest import ROOT, Capture
 
@@ -112,13 +112,13 @@ def test_json_says_what_was_drawn(tmp_path: Path, capsys: Capture) -> None:
 def test_the_time_that_is_said_is_the_whole_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
-    whole = jobs.read_scenes
+    whole = scenes.read_scenes
 
     def slow(*arguments: Any, **named: Any) -> Any:
         time.sleep(0.5)
         return whole(*arguments, **named)
 
-    monkeypatch.setattr(jobs, "read_scenes", slow)
+    monkeypatch.setattr(scenes, "read_scenes", slow)
     assert render(PLAIN, *SIZE, "--json", "-o", tmp_path / "x.png") == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["seconds"] >= 0.5
