@@ -36,11 +36,11 @@ import os, signal, sys, time
 from pathlib import Path
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings, Resources
-from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.out_of_core import store
 from sparklod_cli.system import interrupts
 
 source, target, scratch, method, suffix, moment, how = sys.argv[1:]
-left, write = int(moment), Store._write
+left, encode = int(moment), store.encode
 
 def end():
     if how == "kill":
@@ -54,12 +54,12 @@ def halfway(pieces):
             end()
         yield piece
 
-def failing(self, name, pieces):
+def failing(arrays):
     global left
     left -= 1
-    return write(self, name, halfway(pieces) if left == 0 else pieces)
+    return halfway(encode(arrays)) if left == 0 else encode(arrays)
 
-Store._write = failing
+store.encode = failing
 interrupts.handle()
 try:
     bake(Path(source), Path(target), BakeSettings(method=method, suffix=suffix), say=print,

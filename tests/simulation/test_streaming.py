@@ -91,7 +91,7 @@ def check_twin(data: st.DataObject, chunks: Chunks, network: Network) -> None:
         assert seen == [chunk for _, chunk in twin.arrivals]
         assert stream.received == twin.received
         assert here(stream) == set(twin.cache.used)
-        assert capacity is None or len(stream.cache) <= capacity
+        assert capacity is None or len(here(stream)) <= capacity
     complete_in = stream.complete_in(requested)
     if capacity is not None and len(twin.cache.requested) > capacity:
         assert complete_in is None

@@ -65,9 +65,9 @@ def start_warmup() -> None:
 
 def start_workers() -> None:
     pytest.importorskip("distributed")
-    from sparklod_cli.bake.out_of_core.cluster import ClusterSettings, cluster
+    from sparklod_cli.bake.out_of_core.cluster import cluster
 
-    with cluster(ClusterSettings(workers=1, threads=1)):
+    with cluster(workers=1, threads=1):
         pass
 
 

@@ -33,7 +33,7 @@ def test_it_has_the_bytes_of_a_folder(store: Store, tmp_path: Path) -> None:
     (path,) = tmp_path.rglob("*.npy")
     with (store.folder / "stage/1.npy").open() as file:
         assert file.read() == path.read_bytes()
-    assert store.written == folder.traffic.written > 1_200_000
+    assert store.written == folder.written > 1_200_000
 
 
 def test_what_is_put_is_got(store: Store) -> None:
