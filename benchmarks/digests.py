@@ -61,14 +61,9 @@ LINES = {
     "palette": "build-lod quality.spz -o palette.rad --cluster-sh 16",
     "streamed sog": "build-lod {scene} -o web/lod-meta.json",
     "streamed sog, quick": "build-lod {scene} --method quick --levels 50%,10% -o quick-web/lod-meta.json",
-    **{
-        name: f"build-lod {{scene}} --encoding {name} -o {name}.npz" for name in ("packed", "ext", "lodtree", "texture")
-    },
+    **{name: f"convert quality.spz {name}.npz --layout {name}" for name in ("packed", "ext", "lodtree", "texture")},
     "refined": "build-lod quality.spz --refine 8 -o refined.spz",
-    **{
-        f"unlod {suffix}": f"build-lod quality.spz --unlod -o unlod.{suffix}"
-        for suffix in ("ply", "sog", "splat", "spz")
-    },
+    **{f"unlod {suffix}": f"convert quality.spz unlod.{suffix} --leaves" for suffix in ("ply", "sog", "splat", "spz")},
     "cuts": "traverse quality.spz --orbit 3 --budget 20% --no-timing -o cuts.csv --indices-out cuts",
     "cuts, as Spark": "traverse growth.rad --dolly --every 15 --budget 5% --precision packed --no-timing -o spark.csv",
     "streaming": "traverse growth.rad --orbit 4 --budget 30% --bandwidth 20Mbit --no-timing -o stream.csv",

@@ -24,6 +24,7 @@ BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "GOTO_NUM_THREADS", "OMP_NUM_THREADS")
 #: Commands and their lines in `sparklod --help`.
 COMMANDS = {
     "build-lod": "Bake splat files into Level-of-Detail files.",
+    "convert": "Write a splat file in another format.",
     "simplify": "Write a scene with fewer splats, for all cameras.",
     "inspect": "Report on splat files and check them.",
     "traverse": "Simulate what a viewer draws along a camera path.",

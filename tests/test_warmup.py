@@ -96,7 +96,7 @@ def test_commands_that_combine_much_find_all_kernels_compiled(tmp_path: Path) ->
     scene = str(FIXTURES / "sh1-ascii.ply")
     commands = [
         ["build-lod", scene, "--memory", "1GB", "-o", tree],
-        ["build-lod", tree, "-o", sog, "--unlod"],
+        ["convert", tree, sog],
         ["build-lod", sog, sog, "--merge", "-o", tree, "--overwrite"],
         ["build-lod", scene, "--refine", "2", "-o", tree, "--overwrite"],
     ]

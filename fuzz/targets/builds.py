@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.lod.builders import MAX_BASE, MAX_GROWTH, METHODS, MIN_BASE, MIN_GROWTH
 
 from .. import laws, scenes
@@ -25,16 +24,11 @@ def make(rng: Rng) -> Case:
     if rng.integers(3) == 0:
         low, high, name = (MIN_BASE, MAX_BASE, "--base") if method == "quick" else (MIN_GROWTH, MAX_GROWTH, "--growth")
         options += [name, str(pick(rng, (low, high)))]
-    output = "baked.spz"
-    if rng.integers(4) == 0:
-        output = pick(rng, ("baked.npz", "baked.bin"))
-        options += ["--encoding", pick(rng, ENCODINGS)]
-    else:
-        options += ["--spz-version", pick(rng, ("2", "3"))]
-        if rng.integers(3) == 0:
-            options += ["--fractional-bits", str(int(pick(rng, (0, 1, 8, 12, 16, 20, 23, 24))))]
+    options += ["--spz-version", pick(rng, ("2", "3"))]
+    if rng.integers(3) == 0:
+        options += ["--fractional-bits", str(int(pick(rng, (0, 1, 8, 12, 16, 20, 23, 24))))]
     what = f"{len(columns['center'])} splats, {' '.join(options)}"
-    return Case(what, {file: data}, {"file": file, "output": output, "options": options})
+    return Case(what, {file: data}, {"file": file, "output": "baked.spz", "options": options})
 
 
 def check(case: Case, folder: Path) -> None:

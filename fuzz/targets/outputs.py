@@ -56,14 +56,14 @@ def make(rng: Rng) -> Case:
 def check(case: Case, folder: Path) -> None:
     """Bakes, and writes the splats of the tree back; each output passes the check, or there is none."""
     options, plain = case.run["options"], case.run["plain"]
-    if not _written(["scene.ply", *options], folder / options[1]) or options[1].endswith(".json"):
+    if not _written("build-lod", ["scene.ply", *options], folder / options[1]) or options[1].endswith(".json"):
         return
-    _written([options[1], "--unlod", "-o", plain], folder / plain)
+    _written("convert", [options[1], plain, "--leaves"], folder / plain)
 
 
-def _written(arguments: list[str], output: Path) -> bool:
-    """Whether `build-lod` wrote an output, which then passes the check."""
-    done = command(["build-lod", *arguments])
+def _written(name: str, arguments: list[str], output: Path) -> bool:
+    """Whether a command wrote an output, which then passes the check."""
+    done = command([name, *arguments])
     if done.code and output.exists():
         raise LawError(f"exit code {done.code}, but the output was written")
     if not done.code:

@@ -25,7 +25,7 @@ TRAVERSE = (
     *("T --orbit 2 --indices-out cuts --padded -o t.csv", "T --look-at 0,0,0:0,0,1 --pixel-scale-limit 0 --json"),
     *("T --orbit 2 --outside-foveate 0 --summary", "T --orbit 2 --assert leaves>0 --lod-render-scale 0"),
 )
-OTHERS = ("build-lod T --unlod -o plain.ply", "build-lod T --unlod", "build-lod T -o again.spz")
+OTHERS = ("convert T plain.ply", "convert T plain.spz --leaves", "convert T again.spz", "build-lod T -o again.spz")
 
 
 def make(rng: Rng) -> Case:

@@ -7,19 +7,17 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any
 
 from ..bake.flow import bake, stage_shares
 from ..bake.settings import LARGE, Merged, Resources, Source
 from ..bake.settings import Baked as Baked
 from ..bake.settings import BakeSettings as BakeSettings
-from ..codecs.options import WriteOptions
 from ..system.addresses import Place
 from ..system.errors import SparklodError
 from ..system.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from ..bake.simplifying import Extracted
     from ..model.instances import Instance
 
 #: Shows stages of work, by name with their relative times, as one job.
@@ -29,7 +27,7 @@ Job = Callable[[Mapping[str, float]], contextlib.AbstractContextManager[None]]
 Pair = tuple[Source, Place]
 
 #: Result for an input; None where the output exists already.
-Outcome = Union[Baked, "Extracted", SparklodError, None]
+Outcome = Baked | SparklodError | None
 
 
 def merged_source(files: Sequence[Place], instances: Sequence[Instance] = ()) -> Source:
@@ -95,26 +93,3 @@ def bake_files(
                 except SparklodError as error:
                     outcome = error
             yield outcome
-
-
-def extract_files(
-    pairs: Sequence[Pair],
-    options: WriteOptions,
-    suffix: str,
-    *,
-    overwrite: bool = False,
-    threads: int = 1,
-    progress: Progress = silent,
-) -> Generator[Outcome, None, None]:
-    """Write the leaves of each tree as a file of plain splats, and yield the results as `bake_files`."""
-    from ..bake.simplifying import extract_leaves
-
-    for source, target in pairs:
-        assert not isinstance(source, Merged)
-        try:
-            outcome: Outcome = extract_leaves(
-                source, target, options, suffix=suffix, overwrite=overwrite, threads=threads, progress=progress
-            )
-        except SparklodError as error:
-            outcome = error
-        yield outcome

@@ -89,7 +89,7 @@ def as_tree(scene: Scene) -> Scene:
 
 
 def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str, NDArray[np.uint32]]:
-    """Return a scene in the layout of a viewer's memory, as `build-lod --encoding` writes it (docs/formats/memory.md).
+    """Return a scene in the layout of a viewer's memory, as `convert --layout` writes it (docs/formats/memory.md).
 
     Args:
         scene: a scene or a tree.

@@ -42,7 +42,6 @@ class BakeSettings:
         up: axis of the input that points up, one of `scene.AXES`; None for that of the file.
         rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
         suffix: of the format, one of `WRITABLE` that holds trees.
-        encoding, raw: name in `codecs.formats.ENCODINGS`, to write arrays in that layout instead, as .npz or as words.
         detail, tiles: to write a Streamed SOG, or 3D Tiles, instead.
         environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
         environment_beyond: of a Streamed SOG, distance beyond which splats become its environment, in the input's
@@ -52,6 +51,7 @@ class BakeSettings:
         camera_path: a file of training cameras, or of those by which a PSNR is measured, in the coordinates of the
             output; None for cameras that are placed around and inside the scene.
         converts: an input that has a tree keeps it, if its format is another one; otherwise it is refused.
+        recodes: an input that has a tree keeps it in its own format, too, with other options.
         unused: flags of given options that have no effect on a tree; such an input is refused.
     """
 
@@ -65,8 +65,6 @@ class BakeSettings:
     rgba: Path | None = None
     suffix: str = SPZ
     options: WriteOptions = field(default_factory=WriteOptions)
-    encoding: str | None = None
-    raw: bool = False
     detail: DetailSettings | None = None
     tiles: TileSettings | None = None
     environment: Path | None = None
@@ -75,6 +73,7 @@ class BakeSettings:
     refine: FitSettings | None = None
     camera_path: Path | None = None
     converts: bool = False
+    recodes: bool = False
     unused: tuple[str, ...] = ()
 
     @property
@@ -109,13 +108,12 @@ class Baked:
     What other outputs, inputs or steps would have is None or empty.
 
     Attributes:
-        output_format: "spz", "rad", "rad-chunked", "streamed-sog", "3d-tiles", the name of the encoding of arrays, or
-            the name of the format of a simplified scene.
+        output_format: "spz", "rad", "rad-chunked", "streamed-sog", "3d-tiles", or the name of the format
+            of a simplified scene.
         bytes: size of all files of the output.
         version, fractional_bits: of an SPZ output.
         chunks, encodings, sh_codes: of a RAD output; its encodings by the field of `RadOptions`, and the most entries
             of its SH palette.
-        arrays: shapes of the arrays of an output in a viewer's layout, in its order.
         clamped: number of nodes with a value that the output cannot hold, by column of `Splats`.
         clamps: at which ends of the range, and how far beyond.
         format, notes: of the input, for display.
@@ -135,7 +133,6 @@ class Baked:
     chunks: int | None = None
     encodings: dict[str, str] = field(default_factory=dict)
     sh_codes: int | None = None
-    arrays: dict[str, tuple[int, ...]] = field(default_factory=dict)
     detail: WrittenDetail | None = None
     tiles: WrittenTiles | None = None
     simplified: WrittenSet | None = None

@@ -13,22 +13,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.formats import WRITABLE, Format
+from ..codecs.formats import Format
 from ..codecs.losses import Losses, settled_with_losses
 from ..codecs.options import WriteOptions
-from ..codecs.reader import check_valid
-from ..codecs.spz import like
 from ..fitting.settings import FitSettings, Refined
-from ..io.reading import read_scene
-from ..io.writing import encoded, scene_output, write_scene
+from ..io.writing import encoded, write_scene
 from ..model.falloff import MIN_ALPHA
 from ..model.scene import Scene
 from ..model.splats import Splats
 from ..system import interrupts
-from ..system.addresses import Place
-from ..system.errors import FormatError, SparklodError, memory_errors_translated
+from ..system.errors import FormatError, SparklodError
 from ..system.output import Output
-from ..system.progress import Progress, silent
+from ..system.progress import Progress
 from ..system.threads import on_threads
 from ..system.units import count_of
 
@@ -328,19 +324,6 @@ def refined(
     return dataclasses.replace(scene, splats=nodes), report
 
 
-@dataclass(frozen=True, kw_only=True)
-class Extracted(Losses):
-    """Result of extracting the leaves of a tree: numbers of nodes and of leaves, and seconds by stage (read, write)."""
-
-    format: str
-    nodes: int
-    splats: int
-    sh_degree: int
-    bytes: int
-    seconds: dict[str, float]
-    output_format: str
-
-
 def leaves_of(scene: Scene) -> Scene:
     """Return the splats that a tree was built of, as a scene without a tree; raise `FormatError` without a tree."""
     if scene.tree is None:
@@ -349,48 +332,3 @@ def leaves_of(scene: Scene) -> Scene:
     # A leaf is an input splat. One whose opacity is above 1 comes from a writer that rounds up.
     leaves = dataclasses.replace(leaves, opacity=np.minimum(leaves.opacity, np.float32(1)))
     return Scene(leaves, antialiased=scene.antialiased, format=scene.format, header=scene.header, up=scene.up)
-
-
-def extract_leaves(
-    source: Place,
-    target: Place,
-    options: WriteOptions,
-    *,
-    suffix: str,
-    overwrite: bool = False,
-    threads: int = 1,
-    progress: Progress = silent,
-) -> Extracted:
-    """Read the tree of a Level-of-Detail file and write its leaves, in their order, as a file of plain splats.
-
-    Args:
-        options: None is taken from the input, which keeps its values as they are.
-        suffix: of the format, one of `WRITABLE`.
-
-    Raises:
-        FormatError, OutputError: see `io.read_scene` and `io.scene_output`; the file has no tree.
-        InvalidSplatsError, OutOfMemoryError: a leaf is invalid, or all do not fit into memory.
-    """
-    with memory_errors_translated():
-        form = WRITABLE[suffix]
-        out = scene_output(target, form, chunked=options.rad.chunked, overwrite=overwrite)
-        start = time.perf_counter()
-        scene = read_scene(source, threads=threads, progress=progress)
-        leaves = leaves_of(scene)
-        check_valid(leaves.splats, threads)
-        begun = time.perf_counter()
-        # As they are: their opacities make up for nothing.
-        chosen = dataclasses.replace(like(scene.header, options), covering=False)
-        chosen, losses = settled_with_losses(leaves, form, chosen, threads)
-        size = write_scene(out, form, leaves, chosen, threads=threads, progress=progress)
-        seconds = {"read": round(begun - start, 4), "write": round(time.perf_counter() - begun, 4)}
-    return Extracted(
-        format=scene.format,
-        nodes=len(scene.splats),
-        splats=len(leaves.splats),
-        sh_degree=leaves.splats.sh_degree,
-        bytes=size,
-        seconds=seconds,
-        output_format=form.name,
-        **vars(losses),
-    )

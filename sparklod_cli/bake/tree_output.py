@@ -21,7 +21,7 @@ from ..system.addresses import Place
 from ..system.errors import FormatError
 from ..system.output import Output
 from ..system.progress import Progress
-from .settings import SPZ, Baked, BakeSettings
+from .settings import Baked, BakeSettings
 
 if TYPE_CHECKING:
     from ..codecs.encoder import Encoder, Windows
@@ -75,8 +75,6 @@ def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> Buil
     options, simplify = settings.options, settings.simplify
     if settings.detail is not None or settings.tiles is not None:
         return BuiltTree(settings=settings, out=parts_output(target, overwrite=overwrite), options=options)
-    if settings.encoding is not None and simplify is None:
-        return BuiltTree(settings=settings, out=Output(target, overwrite=overwrite), options=options)
     form = WRITABLE[settings.suffix]
     out = scene_output(target, form, chunked=options.rad.chunked, overwrite=overwrite)
     if simplify is not None:
@@ -97,15 +95,13 @@ def keep_tree(tree: BuiltTree, source: Source, scene: Scene) -> None:
     """
     settings, options = tree.settings, tree.options
     held = scene.format.split()[0]
-    rest = settings.detail, settings.tiles, settings.encoding, settings.simplify
+    rest = settings.detail, settings.tiles, settings.simplify
     is_same = all(setting is None for setting in rest) and WRITABLE[settings.suffix].name == held
     is_same_container = bool(scene.header.get("chunked")) == options.rad.chunked
-    converts = settings.converts and settings.encoding is None and not (is_same and is_same_container)
-    if settings.refine is None and not converts:
-        other = next(each for each in (WRITABLE[RAD], WRITABLE[SPZ]) if each.name != held)
+    if settings.refine is None and not settings.recodes and (not settings.converts or (is_same and is_same_container)):
         raise FormatError(
-            "it is a Level-of-Detail file already; --unlod writes its splats back out, and --format"
-            f" {other.suffixes[0][1:]} its tree as {other.name}; --refine fits its merged splats"
+            "it is a Level-of-Detail file already; sparklod convert writes its tree or its leaves in another format,"
+            " and --refine fits its merged splats"
         )
     if settings.unused:
         kept = "is written as it is" if settings.refine is None else "--refine keeps"
@@ -115,11 +111,12 @@ def keep_tree(tree: BuiltTree, source: Source, scene: Scene) -> None:
         )
     if tree.form is None:
         return
-    if is_same and settings.refine is not None:
+    is_plain = dataclasses.replace(options, rad=dataclasses.replace(options.rad, chunked=False)) == DEFAULTS
+    if is_same and (settings.refine is not None or not is_plain or not tree.in_chunks):
         assert not isinstance(source, Merged)  # of which no part is a tree
         tree.stored, tree.options = read_stored(source, options)
         tree.before, tree.is_ordered = scene.splats, True
-    elif is_same and dataclasses.replace(options, rad=dataclasses.replace(options.rad, chunked=False)) == DEFAULTS:
+    elif is_same:
         assert not isinstance(source, Merged)
         tree.form, tree.in_chunks, tree.repacked = None, False, source
     else:
@@ -194,7 +191,8 @@ def write_whole(tree: BuiltTree, threads: int, progress: Progress, **how: Any) -
         baked.bytes, baked.detail = write_levels(
             scene, above, out, settings.detail, options, tree.end, threads, progress
         )
-    elif settings.simplify is not None:
+    else:
+        assert settings.simplify is not None
         from .simplifying import write_simplified
 
         form = WRITABLE[settings.suffix]
@@ -205,15 +203,6 @@ def write_whole(tree: BuiltTree, threads: int, progress: Progress, **how: Any) -
         baked.bytes, baked.simplified = write_simplified(
             scene, settings.simplify, out, *rest, threads=threads, progress=progress, **how
         )
-    else:
-        assert settings.encoding is not None
-        from ..codecs.gpu import dump
-
-        arrays = dump.pack(scene, settings.encoding, threads)
-        pieces = dump.encode(arrays, raw=settings.raw)
-        with out:
-            baked.bytes = out.write(out.target.name, pieces)
-        baked.output_format, baked.arrays = settings.encoding, {name: words.shape for name, words in arrays.items()}
     tree.end("write")
 
 

@@ -157,7 +157,7 @@ MAX_FRACTIONAL_BITS = 24
 #: Deflate levels, and the default; measured in docs/decisions/05-spz.md.
 MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 
-#: Layouts that `--encoding` knows, see `gpu.dump.pack`; docs/formats/memory.md has the arrays of each.
+#: Layouts of `convert --layout`, see `gpu.dump.pack`; docs/formats/memory.md has the arrays of each.
 ENCODINGS = ("packed", "ext", "lodtree", "texture")
 
 #: Layouts after which `gpu.lod_tree.nodes` measures nodes, as Spark does once it has loaded a file: ExtSplats,

@@ -114,7 +114,7 @@ class WriteOptions(CheckedSettings):
 
     spz_version: int | None = setting(
         "SPZ version: 2 gives files 4 to 8 % smaller, 3 rotations ten times as exact. 4 is 3 in zstd, for files without"
-        f" a tree (--unlod, simplify).  [default: {DEFAULT_SPZ_VERSION}]",
+        f" a tree (convert, simplify).  [default: {DEFAULT_SPZ_VERSION}]",
         SPZ_VERSIONS,
     )
     fractional_bits: int | None = setting(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,8 +27,6 @@ from .options.baking import (
     LARGE,
     MANIFESTS,
     OF_CLUSTERS,
-    OF_SCRATCH,
-    OF_TREES,
     POSITION,
     REFINING,
     SELECTION,
@@ -37,15 +35,15 @@ from .options.baking import (
     TREES,
     BuildLodOptions,
     refuse_others,
-    write_options,
 )
 from .paths import NAMELESS, Folder, claim_stdout, is_same_place, keep_apart, require_suffix, with_chunks
 
 if TYPE_CHECKING:
     from ..api.bake_jobs import Outcome, Pair
+    from ..bake.converting import Converted
     from ..bake.settings import Baked, Source
-    from ..bake.simplifying import Extracted, WrittenSet
     from ..codecs.clamps import Clamp
+    from ..codecs.losses import Losses
     from ..fitting.settings import Refined
     from ..model.instances import Instance
 
@@ -63,11 +61,8 @@ EXAMPLES = """\
   sparklod build-lod scene.ply -o city/tileset.json --lat 47.37 --lon 8.54
   sparklod build-lod scene.ply --within 0,1,0,25 --min-opacity 0.02
   sparklod build-lod scene.ply --json | jq .nodes
-  sparklod build-lod scene.sog --encoding ext      # writes scene-lod.npz
   sparklod build-lod scene-lod.spz --format rad    # the same tree
   sparklod build-lod scene-lod.spz --refine        # the same tree, fitted
-  sparklod build-lod scene-lod.spz --unlod -o scene.ply
-  sparklod build-lod scene-lod.spz --unlod -o scene.sog       # for PlayCanvas
   sparklod build-lod scans/*.ply --output-dir web --workers 4
   sparklod build-lod tiles/*.ply --merge -o city-lod.rad
   sparklod build-lod city.ply -o city-lod.rad --memory 4G --scratch-dir /fast
@@ -84,7 +79,16 @@ BOTH = "--output cannot be used with --output-dir"
 HEADINGS = (COMMON, TREE, SELECTION, POSITION, FILE_FORMAT, "RAD", DETAIL, TILED, REFINING, LARGE, CLUSTER)
 
 
-@click.command("build-lod", cls=Command, options=BuildLodOptions, examples=EXAMPLES, headings=HEADINGS)
+#: Options of earlier versions, and what to write instead.
+REPLACED = {
+    "--unlod": "sparklod convert IN OUT --leaves",
+    "--encoding": "sparklod convert IN OUT.npz --layout NAME",
+}
+
+
+@click.command(
+    "build-lod", cls=Command, options=BuildLodOptions, examples=EXAMPLES, headings=HEADINGS, replaced=REPLACED
+)
 @click.pass_context
 def build_lod(ctx: click.Context, /, **_: Any) -> None:
     """Bake splat files into Level-of-Detail files for Spark, PlayCanvas, SuperSplat, Babylon.js and CesiumJS.
@@ -112,7 +116,6 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     general = options.general
     instances = _check(ctx, options)
     failed, console = False, Console(quiet=general.quiet, verbose=general.verbose)
-    report: Callable[..., None] = report_extracted if options.unlod else report_baked
     with console, contextlib.ExitStack() as stack:
         if options.output is not None and (options.merge or options.scene is not None):
             from ..api.bake_jobs import merged_source
@@ -123,33 +126,26 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
             pairs: Sequence[Pair] = [(merged_source(options.inputs, instances), options.output)]
         else:
             pairs = [(source, options.target(source)) for source in options.inputs]
-        how: dict[str, Any] = {"overwrite": options.overwrite, "threads": general.threads, "progress": console.progress}
-        if options.unlod:
-            from ..api.bake_jobs import extract_files
+        from ..api.bake_jobs import bake_files
 
-            console.announce_compiling()
-            form = options.output_form
-            written = write_options(options.written, options.cluster_sh, chunked=form.chunked)
-            outcomes = extract_files(pairs, written, form.suffix, **how)
-        else:
-            from ..api.bake_jobs import bake_files
-
-            settings = options.bake_settings(ctx)
-            console.announce_compiling(settings)
-            outcomes = bake_files(
-                pairs,
-                settings,
-                **how,
-                job=console.job,
-                say=console.say,
-                skip=options.skip_existing,
-                memory=options.memory,
-                scratch_dir=options.scratch_dir,
-                resume=options.resume,
-                scheduler=options.scheduler,
-                workers=options.workers,
-                cluster_threads=general.threads if options.scheduler is None or is_set(ctx, "threads") else None,
-            )
+        settings = options.bake_settings(ctx)
+        console.announce_compiling(settings)
+        outcomes = bake_files(
+            pairs,
+            settings,
+            overwrite=options.overwrite,
+            threads=general.threads,
+            progress=console.progress,
+            job=console.job,
+            say=console.say,
+            skip=options.skip_existing,
+            memory=options.memory,
+            scratch_dir=options.scratch_dir,
+            resume=options.resume,
+            scheduler=options.scheduler,
+            workers=options.workers,
+            cluster_threads=general.threads if options.scheduler is None or is_set(ctx, "threads") else None,
+        )
         stack.enter_context(contextlib.closing(outcomes))
         for (source, target), outcome in zip(pairs, outcomes, strict=True):
             if isinstance(outcome, SparklodError):
@@ -158,7 +154,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
             elif outcome is None:
                 console.say(f"{name_of(source)}  ->  {target}  exists already")
             else:
-                report(console, source, "standard output" if target == DASH else str(target), outcome)
+                report_baked(console, source, "standard output" if target == DASH else str(target), outcome)
             if options.as_json:
                 print_json(record_of(source, target, outcome))
             if interrupts.came.is_set():  # during fitting, which then ends early
@@ -178,7 +174,7 @@ def _check(ctx: click.Context, options: BuildLodOptions) -> list[Instance]:
     inputs, output, form, merging = options.inputs, options.output, options.output_form, ""
     if options.merge or options.scene is not None:
         merging = "--merge" if options.merge else "--scene"
-        refuse(ctx, ("output_dir", "unlod", "rgba"), f"cannot be used with {merging}")
+        refuse(ctx, ("output_dir", "rgba"), f"cannot be used with {merging}")
         if output is None:
             raise click.UsageError(f"{merging} makes one file of all inputs; name it with --output")
     instances: list[Instance] = []
@@ -221,8 +217,6 @@ def _check(ctx: click.Context, options: BuildLodOptions) -> list[Instance]:
         refuse(ctx, ["workers"], "cannot be used with --scheduler, whose workers run already")
     if is_set(ctx, "refine"):
         refuse(ctx, ["scratch_dir", "resume"], "cannot be used with --refine, which needs the whole tree in memory")
-    if options.unlod:
-        refuse(ctx, (*OF_SCRATCH, *OF_CLUSTERS, "refine", "skip_existing"), "cannot be used with --unlod")
     if DASH in inputs:
         refuse(
             ctx, OF_CLUSTERS, "cannot be used with standard input, which workers cannot read; save it to a file first"
@@ -233,7 +227,7 @@ def _check(ctx: click.Context, options: BuildLodOptions) -> list[Instance]:
 def check_formats(ctx: click.Context, options: BuildLodOptions) -> None:
     """Raise a `click.UsageError` where the options of formats, and the name of the output, contradict each other."""
     form, suffix, output = options.output_form, ending_of(options.name), options.output
-    chosen = options.form is not None or options.encoding is not None or output is not None
+    chosen = options.form is not None or output is not None
     suffixes = {source.suffix.lower() for source in options.inputs}
     if options.refine is not None and not chosen and RAD in suffixes and len(suffixes) > 1:
         raise click.UsageError(
@@ -245,40 +239,24 @@ def check_formats(ctx: click.Context, options: BuildLodOptions) -> None:
         return
     if form.chunked and output == DASH:
         raise click.UsageError("--format rad-chunked writes several files; name the output, or use --format rad")
-    if options.encoding:
-        refuse(ctx, ("form",), "cannot be used with --encoding")
-        refuse_others(ctx, "--encoding", hints=False)
     if options.form is not None and suffix not in ("", form.suffix):
         raise click.UsageError(f"--format {options.form} writes {form.suffix}, not {suffix}")
     if output is not None and options.form is None:
-        arrays, trees = (NPZ, *RAW_SUFFIXES), (*TREES, MANIFEST, TILESET)
-        require_suffix("--output", output, arrays if options.encoding else WRITABLE if options.unlod else trees)
-    if options.unlod:
-        if options.name in MANIFESTS:
-            raise click.UsageError(f"--unlod writes splats without detail levels, not {options.name}")
-        refuse(ctx, (*OF_TREES, "encoding"), "cannot be used with --unlod")
-        if suffix not in ("", *WRITABLE):
-            raise click.UsageError(f"--unlod writes {', '.join(WRITABLE)}, not {suffix}")
-    elif options.encoding:
-        if suffix not in ("", NPZ, *RAW_SUFFIXES):
-            raise click.UsageError(f"--encoding writes {', '.join((NPZ, *RAW_SUFFIXES))}, not {suffix}")
-        return
-    else:
-        known = f"{', '.join((*TREES, MANIFEST))} or {TILESET}"
-        if suffix in (NPZ, *RAW_SUFFIXES):
-            raise click.UsageError(f"{suffix} is a file of arrays; choose their layout with --encoding")
-        if suffix in PLAIN:
-            raise click.UsageError(f"{suffix} cannot hold a tree; name the output {known}")
-        if suffix not in ("", *TREES):
-            names = f"{', '.join((*TREES.values(), DETAIL))} or {TILED}"
-            raise click.UsageError(f"trees are written as {names}, not as {suffix}; name the output {known}")
-    refuse_others(ctx, WRITABLE[form.suffix].name, hints=not options.unlod)
+        require_suffix("--output", output, (*TREES, MANIFEST, TILESET))
+    known = f"{', '.join((*TREES, MANIFEST))} or {TILESET}"
+    if suffix in (NPZ, *RAW_SUFFIXES):
+        raise click.UsageError(f"{suffix} holds arrays; bake a tree, and write it with sparklod convert --layout")
+    if suffix in PLAIN:
+        raise click.UsageError(f"{suffix} cannot hold a tree; name the output {known}, or write sparklod convert")
+    if suffix not in ("", *TREES):
+        names = f"{', '.join((*TREES.values(), DETAIL))} or {TILED}"
+        raise click.UsageError(f"trees are written as {names}, not as {suffix}; name the output {known}")
+    refuse_others(ctx, WRITABLE[form.suffix].name)
 
 
 def _check_cuts(ctx: click.Context, options: BuildLodOptions) -> None:
     form, output = options.output_form, options.output
     flag = f"--format {MANIFESTS[form.manifest]}"
-    refuse(ctx, ("unlod", "encoding"), f"cannot be used with {flag}")
     if output == DASH:
         raise click.UsageError(f"{flag} writes several files; name the output, such as web/{form.manifest}")
     if output is not None and options.name != form.manifest:
@@ -291,7 +269,7 @@ def _check_cuts(ctx: click.Context, options: BuildLodOptions) -> None:
         refuse(ctx, ("environment_beyond",), "cannot be used with --environment")
 
 
-def record_of(source: Source, target: Place, outcome: Outcome) -> dict[str, Any]:
+def record_of(source: Source, target: Place, outcome: Outcome | Converted) -> dict[str, Any]:
     """Return the JSON of a result; several inputs that are one scene are "inputs"."""
     if isinstance(source, (Path, Address)):
         record: dict[str, Any] = {"input": str(source)}
@@ -416,8 +394,6 @@ def _written(baked: Baked) -> str:
         return "Streamed SOG"
     if baked.tiles is not None:
         return "3D Tiles"
-    if baked.arrays:
-        return ", ".join(f"{name} uint32{list(shape)}" for name, shape in baked.arrays.items())
     if baked.chunks is None:
         return f"SPZ {baked.version} LoD, {baked.fractional_bits} fractional bits"
     palette = f", a palette of {baked.sh_codes:,} SH" if baked.sh_codes else ""
@@ -461,18 +437,22 @@ def _clamped(clamp: Clamp, baked: Baked) -> str:
     )
 
 
-def report_extracted(console: Console, source: Place, target: str, extracted: Extracted) -> None:
-    """Print a line about the file."""
-    console.say(
-        f"{name_of(source)}  {count_of(extracted.nodes, 'node')}  ->  {target} "
-        f" {count_of(extracted.splats, 'splat')}, SH {extracted.sh_degree}, {format_size(extracted.bytes)},"
-        f" {sum(extracted.seconds.values()):.1f} s"
-    )
-    _report_losses(console, extracted, extracted.splats, extracted.output_format)
-    console.detail(f"  {extracted.format}; {_stages(extracted.seconds)}")
+def report_converted(console: Console, source: Place, target: str, made: Converted) -> None:
+    """Print a line about splats or arrays, and what their format does not hold."""
+    from ..model.selection import describe
+
+    read = count_of(made.splats if made.nodes is None else made.nodes, "splat" if made.nodes is None else "node")
+    arrays = ", ".join(f"{name} uint32{list(shape)}" for name, shape in made.arrays.items())
+    written = arrays or f"{count_of(made.splats, 'splat')}, SH {made.sh_degree}"
+    seconds = sum(made.seconds.values())
+    console.say(f"{name_of(source)}  {read}  ->  {target}  {written}, {format_size(made.bytes)}, {seconds:.1f} s")
+    if made.dropped:
+        console.say(f"  left out: {describe(made.dropped)}")
+    _report_losses(console, made, made.splats, made.output_format)
+    console.detail(f"  {made.format} -> {made.output_format}; {_stages(made.seconds)}")
 
 
-def _report_losses(console: Console, losses: Extracted | WrittenSet, splats: int, form: str) -> None:
+def _report_losses(console: Console, losses: Losses, splats: int, form: str) -> None:
     lines = ["holds no reflections (SH)"] if losses.drops_sh else []
     lines += [
         f"clamps the {COLUMNS[column]} of {percent_of(count / splats)} of the splats"

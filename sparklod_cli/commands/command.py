@@ -48,9 +48,10 @@ TREES = (".spz", ".rad")
 ALIASES = {
     "bake": "build-lod",
     "build": "build-lod",
-    "convert": "build-lod",
     "lod": "build-lod",
-    "unlod": "build-lod --unlod",
+    "unlod": "convert",
+    "transcode": "convert",
+    "export": "convert",
     "decimate": "simplify",
     "reduce": "simplify",
     "check": "inspect",

@@ -330,6 +330,6 @@ def _of_arrays(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) ->
         form, count = "NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0
         note = "it has centres, covariances and colours of nodes, but no opacities above 1, SH and children"
     else:
-        raise FormatError(f"its arrays ({', '.join(arrays)}) match no encoding that build-lod writes")
+        raise FormatError(f"its arrays ({', '.join(arrays)}) match no layout that convert writes")
     fields |= {"format": form, "splats": count, "notes": [note]}
     return fields | ({} if settings.check else {"findings": None}), scene

@@ -181,7 +181,7 @@ def unknown_format(head: bytes, path: Place) -> FormatError:
     unmarked = " or ".join(ending for each in FORMATS if each.unmarked for ending in each.suffixes)
     hint = f"; {unmarked} is not recognised by its content: pass it as a file" if path == DASH else ""
     if path.suffix.lower() in RAW_SUFFIXES:
-        hint = "; a file with this suffix has only words, as --encoding writes them, without a header"
+        hint = "; a file with this suffix has only words, as convert --layout writes them, without a header"
     return UnknownFormatError(f"not a splat file that sparklod reads ({names}){hint}")
 
 

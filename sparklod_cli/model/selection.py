@@ -64,6 +64,7 @@ class Selection:
         min_opacity: keep splats of at least this opacity, 0..1.
         min_box, max_box: keep splats whose centre lies in this box, borders (as float32) included; world units.
         within: keep splats whose centre lies in this ball: centre and radius, world units.
+        drop_invisible: drop splats without opacity or size, which are no part of a tree.
     """
 
     drop_invalid: bool = False
@@ -71,6 +72,7 @@ class Selection:
     min_box: Vector | None = None
     max_box: Vector | None = None
     within: tuple[Vector, float] | None = None
+    drop_invisible: bool = True
 
     def apply(self, splats: Splats, *, threads: int = 1) -> tuple[Splats, dict[str, int]]:
         """Return the splats that are kept, in their order, and the number dropped for each of `REASONS` that occurred.
@@ -96,12 +98,18 @@ class Selection:
 
     def _examine(self, splats: Splats) -> tuple[NDArray[np.bool_], SelectionTally]:
         invalid = splats.invalid()
-        keeps = {kind: ~mask for kind, mask in invalid.items()} | {
+        visible = {
             "zero_opacity": splats.opacity > 0,
             "zero_scale": np.maximum.reduce(splats.scale.T, initial=0) > 0,
-            "low_opacity": splats.opacity >= self.min_opacity,
-            "cropped": self._inside(splats.center),
         }
+        keeps = (
+            {kind: ~mask for kind, mask in invalid.items()}
+            | (visible if self.drop_invisible else {})
+            | {
+                "low_opacity": splats.opacity >= self.min_opacity,
+                "cropped": self._inside(splats.center),
+            }
+        )
         keep = np.ones(len(splats), np.bool_)
         dropped = {}
         for reason in (reason for reason in REASONS if reason in keeps):

@@ -11,9 +11,9 @@ import pytest
 
 import sparklod_cli as sparklod
 from sparklod_cli.api.files import Tree
+from sparklod_cli.bake.converting import convert
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
-from sparklod_cli.bake.simplifying import extract_leaves
 from sparklod_cli.codecs.formats import ENCODINGS, MANIFEST, WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.spark_codings import SplatEncoding
@@ -135,5 +135,5 @@ def test_what_a_file_has_is_examined_before_it_is_written(spoiled_file: Path, tm
             bake(spoiled_file, tmp_path / "out", settings)
     for ending in WRITABLE:
         with pytest.raises(InvalidSplatsError, match="1 of 60 splats is"):
-            extract_leaves(spoiled_file, tmp_path / f"out{ending}", WriteOptions(), suffix=ending)
+            convert(spoiled_file, tmp_path / f"out{ending}", BakeSettings(suffix=ending), leaves=True)
     assert not list(tmp_path.iterdir())

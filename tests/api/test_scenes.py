@@ -60,8 +60,9 @@ def test_a_tree_is_what_the_command_bakes(scene: sparklod.Scene, tmp_path: Path,
 
 @pytest.mark.parametrize("encoding", ["packed", "ext", "lodtree", "texture"])
 def test_arrays_are_what_the_command_writes(scene: sparklod.Scene, tmp_path: Path, encoding: str) -> None:
-    command("build-lod", DEMO, "--encoding", encoding, "-o", tmp_path / "theirs.npz", "-q")
-    sparklod.write(tmp_path / "ours.npz", sparklod.build_lod(scene), encoding=encoding)
+    sparklod.write(tmp_path / "tree.spz", sparklod.build_lod(scene))
+    command("convert", tmp_path / "tree.spz", tmp_path / "theirs.npz", "--layout", encoding, "-q")
+    sparklod.write(tmp_path / "ours.npz", sparklod.read(tmp_path / "tree.spz"), encoding=encoding)
     assert (tmp_path / "ours.npz").read_bytes() == (tmp_path / "theirs.npz").read_bytes()
 
 

@@ -156,11 +156,11 @@ def test_an_axis_that_a_format_specifies_is_noted_in_the_output(
     assert is_upright(target, tmp_path)
 
 
-@pytest.mark.parametrize("way", ["--unlod", "simplify"])
+@pytest.mark.parametrize("way", ["convert", "simplify"])
 def test_a_plain_spz_of_sparklod_has_the_axes_of_what_it_was_made_from(way: str, folder: Path, tmp_path: Path) -> None:
     target, tree = tmp_path / "x.spz", folder / "tree.rad"
-    options = ["build-lod", str(tree), way] if way == "--unlod" else ["simplify", str(tree), "--to", "90%"]
-    assert run([*options, "-o", str(target)]) == 0
+    options = [str(target), "--leaves"] if way == "convert" else ["--to", "90%", "-o", str(target)]
+    assert run([way, str(tree), *options]) == 0
     assert sparklod.read(target).up is None
     assert not is_upright(target, tmp_path)
 
@@ -192,5 +192,5 @@ def test_up_is_in_the_short_help_of_every_command_that_has_it(name: str, capsys:
     assert command is not None
     assert run([name, "--help"]) == 0
     has_it = any(parameter.name == "up" for parameter in command.params)
-    assert has_it == (name in ("build-lod", "simplify", "render", "traverse", "view"))
+    assert has_it == (name in ("build-lod", "convert", "simplify", "render", "traverse", "view"))
     assert (" --up " in capsys.readouterr().out) == has_it

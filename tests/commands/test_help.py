@@ -197,7 +197,7 @@ def test_an_option_that_there_is_not_names_the_one_that_was_meant(
     ("arguments", "hint"),
     [
         (["warmup", "--outside-foveate", "1"], "; traverse, render have it"),
-        (["inspect", "--unlod"], "; build-lod has it"),
+        (["inspect", "--leaves"], "; convert has it"),
         (["--overwrite", "build-lod"], "; options of a command follow its name, as in sparklod build-lod --overwrite"),
         (["-q"], "; options of a command follow its name, as in sparklod build-lod -q"),
         (["inspect", "--max-bytes", "9"], " any more; write --assert 'bytes<=N'"),

@@ -17,6 +17,7 @@ PLAIN, TREE = FIXTURES / "sh0.ply", FIXTURES / "golden" / "hand-tree-v3.spz"
 #: By command, arguments that print an object with little work; {} stands for a new file or folder.
 LITTLE = {
     "build-lod": [PLAIN, "-o", "{}.spz"],
+    "convert": [PLAIN, "{}.sog"],
     "simplify": [PLAIN, "--to", "50%", "-o", "{}.ply"],
     "inspect": [TREE],
     "traverse": [TREE, "--orbit", "2"],

@@ -28,6 +28,7 @@ INPUTS: dict[str, dict[str, tuple[object, ...]]] = {
         "environment": (PLAIN, "--environment", "X"),
         "camera_path": (PLAIN, "--refine", "--camera-path", "X"),
     },
+    "convert": {"source": ("X",), "rgba": (PLAIN, "--rgba", "X")},
     "simplify": {
         "inputs": ("X", "--to", "50%"),
         "rgba": (PLAIN, "--to", "50%", "--rgba", "X"),
@@ -53,6 +54,7 @@ INPUTS: dict[str, dict[str, tuple[object, ...]]] = {
 #: How each command is told to write the file Y, by the parameter that says so.
 OUTPUTS: dict[str, dict[str, tuple[str, ...]]] = {
     "build-lod": {"output": ("-o", "Y")},
+    "convert": {"output": ("Y",)},
     "simplify": {"output": ("-o", "Y")},
     "inspect": {"plot": ("--plot", "Y"), "html": ("--html", "Y"), "chunks_out": ("--chunks-out", "Y")},
     "traverse": {"output": ("-o", "Y"), "plot": ("--plot", "Y")},
@@ -61,7 +63,14 @@ OUTPUTS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 
 #: Names that the command's outputs can have.
-SUFFIXES = {"build-lod": ".spz", "simplify": ".spz", "inspect": ".png", "traverse": ".csv", "render": ".png"}
+SUFFIXES = {
+    "build-lod": ".spz",
+    "convert": ".spz",
+    "simplify": ".spz",
+    "inspect": ".png",
+    "traverse": ".csv",
+    "render": ".png",
+}
 
 ROWS = [
     (command, given, written)
@@ -198,6 +207,7 @@ def test_devices_are_not_replaced() -> None:
 #: Parameters that take addresses; tests/commands/build_lod/test_addresses.py has them.
 TAKE_ADDRESSES = {
     *(("build-lod", name) for name in ("inputs", "output", "output_dir")),
+    *(("convert", name) for name in ("source", "output")),
     *(("simplify", name) for name in ("inputs", "output")),
 }
 

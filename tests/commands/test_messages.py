@@ -155,7 +155,7 @@ def test_counts_of_one_have_a_singular_noun(tmp_path: Path, capsys: Capture) -> 
     lod = tmp_path / "one-lod.spz"
     for arguments in (
         ["build-lod", PLAIN, "-o", lod, "-v"],
-        ["build-lod", lod, "--unlod", "-o", tmp_path / "back.ply"],
+        ["convert", lod, tmp_path / "back.ply"],
         ["inspect", PLAIN],
         ["inspect", lod],
         ["inspect", lod, "--assert", "leaves>=2"],
@@ -305,7 +305,7 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> Break:
     return end_in
 
 
-@pytest.mark.parametrize("command", ["build-lod", "build-lod --unlod", "inspect", "inspect --check", "render"])
+@pytest.mark.parametrize("command", ["build-lod", "convert", "inspect", "inspect --check", "render"])
 @pytest.mark.parametrize(
     "error",
     [ZeroDivisionError("division\nby zero"), EOFError("cut"), AssertionError(), KeyError("x"), StopIteration(1)],
@@ -314,8 +314,8 @@ def test_a_bug_is_one_line_that_asks_for_a_report(
     command: str, error: Exception, broken: Break, tmp_path: Path, capsys: Capture
 ) -> None:
     broken(error)
-    out = [] if command.startswith("inspect") else ["-o", str(tmp_path / "out.spz" if "build" in command else "a.png")]
-    assert run([*command.split(), str(SCENE), *out]) == 1
+    out = {"build-lod": ["-o", f"{tmp_path}/out.spz"], "convert": [f"{tmp_path}/a.ply"], "render": ["-o", "a.png"]}
+    assert run([*command.split(), str(SCENE), *out.get(command, [])]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: sparklod failed in a way that it should not: ")
     assert type(error).__name__ in line

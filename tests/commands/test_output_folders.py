@@ -79,8 +79,6 @@ def test_a_name_without_suffix_is_refused_with_a_hint(command: str, name: str, t
     [
         ((), ".spz, .rad, /lod-meta.json, /tileset.json"),
         (("--refine",), ".spz, .rad, /lod-meta.json, /tileset.json"),
-        (("--unlod",), ".ply, .spz, .rad, .sog, /meta.json, .glb, .splat"),
-        (("--encoding", "ext"), ".npz, .bin, .raw"),
     ],
 )
 def test_the_hint_names_the_formats_that_are_possible(

@@ -1,4 +1,4 @@
-"""What `build-lod --encoding` writes is reported as far as its arrays tell, and no further."""
+"""Arrays that `convert --layout` writes are reported by what they hold."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ ALL = ReportSettings(values=True, all_quantities=True, check=True)
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same tree as SPZ and in every encoding."""
     folder = tmp_path_factory.mktemp("arrays")
-    for name, options in {"tree.spz": [], **{f"{each}.npz": ["--encoding", each] for each in ENCODINGS}}.items():
-        assert run(["build-lod", str(SCENE), "-q", "-o", str(folder / name), *options]) == 0
+    tree = str(folder / "tree.spz")
+    assert run(["build-lod", str(SCENE), "-q", "-o", tree]) == 0
+    for each in ENCODINGS:
+        assert run(["convert", tree, str(folder / f"{each}.npz"), "-q", "--layout", each]) == 0
     return folder
 
 
@@ -95,9 +97,9 @@ def test_other_commands_say_that_they_are_no_scene(folder: Path, capsys: Capture
 def test_words_alone_tell_nothing(tmp_path: Path, capsys: Capture) -> None:
     for suffix in (".bin", ".raw"):
         path = tmp_path / f"tree{suffix}"
-        assert run(["build-lod", str(SCENE), "-q", "--encoding", "ext", "-o", str(path)]) == 0
+        assert run(["convert", str(SCENE), str(path), "-q", "--layout", "ext"]) == 0
         assert run(["inspect", str(path)]) == 1
-        assert "a file with this suffix has only words, as --encoding writes them, without a header" in (
+        assert "a file with this suffix has only words, as convert --layout writes them, without a header" in (
             capsys.readouterr().err
         )
 
@@ -105,7 +107,7 @@ def test_words_alone_tell_nothing(tmp_path: Path, capsys: Capture) -> None:
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"other": np.zeros((3, 4), np.uint32)}, "its arrays (other) match no encoding"),
+        ({"other": np.zeros((3, 4), np.uint32)}, "its arrays (other) match no layout"),
         ({"packed": np.zeros((3, 5), np.uint32)}, "packed is uint32[3, 5], expected uint32[3, 4]"),
         ({"packed": np.zeros((3, 4))}, "packed is float64[3, 4], expected uint32[3, 4]"),
         ({"ext0": np.zeros((3, 4), np.uint32)}, "no array ext1"),

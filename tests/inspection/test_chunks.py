@@ -124,8 +124,8 @@ def test_the_table_of_a_chunked_file_is_that_of_the_whole_one(tmp_path: Path) ->
 
 
 def test_the_table_of_what_has_no_splats_is_refused(tmp_path: Path, capsys: Capture) -> None:
-    source = FIXTURES / "sh0.ply"
-    assert run(["build-lod", str(source), "--encoding", "lodtree", "-o", str(tmp_path / "a.npz"), "-q"]) == 0
+    source = FIXTURES / "golden" / "tree-v3.spz"
+    assert run(["convert", str(source), str(tmp_path / "a.npz"), "--layout", "lodtree", "-q"]) == 0
     assert run(["inspect", str(tmp_path / "a.npz"), "--chunks", "-q"]) == 1
     assert "its chunks are unknown" in capsys.readouterr().err
 

@@ -124,7 +124,7 @@ def test_a_path_leads_to_a_value_of_the_report(tree: Report) -> None:
 
 def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: Capture) -> None:
     splats = tmp_path / "splats.spz"
-    assert run(["build-lod", "--unlod", str(TREE), "-o", str(splats), "-q"]) == 0
+    assert run(["convert", str(TREE), str(splats), "--leaves", "-q"]) == 0
     assert run(["inspect", str(TREE), "--leaves-of", str(splats)]) == 0
     assert capsys.readouterr().out == ""
     assert run(["inspect", str(TREE), "--leaves-of", str(PLAIN)]) == 3

@@ -130,7 +130,6 @@ def _reason(
 def _needs_whole_tree(settings: BakeSettings) -> str | None:
     """Return why an output is made in memory only, as the end of a sentence; None if it can be made in blocks."""
     reasons = {
-        "--encoding writes arrays as a whole": settings.encoding,
         "--refine fits a whole tree": settings.refine,
         "a simplified scene is a cut of a whole tree": settings.simplify,
         "tiles are made of a whole tree": settings.tiles,

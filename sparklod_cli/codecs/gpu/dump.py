@@ -64,7 +64,7 @@ def decode_npz(file: BinaryIO) -> Arrays | None:
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
     # Stored members cannot claim more than the file has; compressed ones could, and build-lod writes none.
     if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1:
-        raise FormatError(f"its member {quoted_value(member.filename)} is compressed, unlike those of --encoding")
+        raise FormatError(f"its member {quoted_value(member.filename)} is compressed, unlike those of convert --layout")
     try:
         with archive.open(member) as file:
             data = io.BytesIO(file.read())

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from ...codecs.formats import ENCODINGS, MANIFEST, NPZ, RAW_SUFFIXES, TILESET, WRITABLE, ending_of
+from ...codecs.formats import MANIFEST, TILESET, WRITABLE, ending_of
 from ...codecs.formats import RAD_SUFFIX as RAD
 from ...codecs.options import MAX_SH_CODES, SH_CODES, RadOptions, SogOptions, WriteOptions
 from ...fitting import FIT_DEVICE_HELP, SEED, SEED_HELP, STEPS
@@ -217,7 +217,7 @@ class BuildLodOptions:
     output: Place | None = setting(
         "Output of a single input, or a folder for all outputs; - is standard output.  [default: NAME-lod.spz beside"
         f" the input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format {STREAMED_SOG},"
-        f" NAME-lod/{TILESET} with --format {TILES_3D}, NAME-lod.npz with --encoding, NAME-unlod.spz with --unlod,"
+        f" NAME-lod/{TILESET} with --format {TILES_3D},"
         " NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
         NamedPath(output=True, addresses=True),
         **OUTPUT,
@@ -236,12 +236,6 @@ class BuildLodOptions:
         heading=LARGE,
         metavar="[=verify]",
         bare=BY_DATE,
-    )
-    unlod: bool = flag(
-        "Write the leaves of Level-of-Detail files instead: the original splats as the file holds them, rounded, with"
-        " opacities that make up for it. As SPZ or, by the name of FILE, .rad, .ply, .sog, DIR/meta.json (an unpacked"
-        " SOG), .glb or .splat, which has no SH.",
-        heading=COMMON,
     )
     form: str | None = setting(
         "Format of the output. rad is what Spark streams; rad-chunked writes each chunk to a file of its own,"
@@ -271,12 +265,6 @@ class BuildLodOptions:
     )
     seed: int = setting(SEED_HELP, SEED, 0, needs="refine", heading=REFINING)
     device: str = setting(FIT_DEVICE_HELP, DEVICES, "cpu", needs="refine", heading=REFINING)
-    encoding: str | None = setting(
-        f"Write arrays in a viewer's memory layout instead: a {NPZ} file, or the words alone if FILE ends in"
-        f" {' or '.join(RAW_SUFFIXES)}.",
-        ENCODINGS,
-        heading=FILE_FORMAT,
-    )
     method: str | None = setting(
         "How splats are merged: quick takes seconds; quality takes longer, and its cuts come closer to full detail."
         f"  [default: {METHOD}; {METHOD_OF_DETAIL} with --format {STREAMED_SOG} or {TILES_3D}]",
@@ -362,12 +350,12 @@ class BuildLodOptions:
     def output_form(self) -> OutputForm:
         """Format of the output, by --format, or else by the name of the output."""
         form = self.form
-        if form is None and not (self.encoding or self.unlod):
+        if form is None:
             form = MANIFESTS.get(self.name)
         if form is not None:
             return FORMS[form]
         refines_rad = self.refine is not None and {each.suffix.lower() for each in self.inputs} == {RAD}
-        return OutputForm(NPZ if self.encoding else ending_of(self.name) or (RAD if refines_rad else SPZ))
+        return OutputForm(ending_of(self.name) or (RAD if refines_rad else SPZ))
 
     def target(self, source: Place) -> Place:
         """Return the output for an input."""
@@ -375,13 +363,11 @@ class BuildLodOptions:
             return self.output
         form, stem = self.output_form, stem_of(source)
         known = self.form is not None or self.refine is not None
-        if form.cuts or self.unlod or (known and source.suffix.lower() in TREES):
+        if form.cuts or (known and source.suffix.lower() in TREES):
             stem = stem.removesuffix("-lod")  # a tree in another format has its name
         name = f"{stem}-lod{form.suffix}"
         if form.cuts:
             name = f"{stem}-lod/{form.manifest}"
-        elif self.unlod:
-            name = f"{stem}-unlod{form.suffix}"
         elif self.refine is not None and name == source.name:
             name = f"{stem}-lod-refined{form.suffix}"
         return (self.output_dir or source.parent) / name
@@ -409,8 +395,6 @@ class BuildLodOptions:
             **self.input_scene.settings(),
             suffix=form.suffix,
             options=write_options(self.written, self.cluster_sh, chunked=form.chunked),
-            encoding=self.encoding,
-            raw=self.output is not None and ending_of(self.name) != NPZ,
             detail=self.detail if form.cuts == DETAIL else None,
             tiles=self.tiles if form.cuts == TILED else None,
             environment=self.environment,
@@ -427,7 +411,7 @@ OF_FORMATS: tuple[tuple[Iterable[str], tuple[str, ...], str], ...] = (
     (("spz_version", "fractional_bits"), ("SPZ",), ""),
     (parameters_of(RadOptions), ("RAD",), "; name the output .rad, or add --format rad"),
     (("compression_level",), ("SPZ", "RAD"), ""),
-    (("glb_profile",), ("GLB", TILED), "; GLB is written by --unlod and simplify"),
+    (("glb_profile",), ("GLB", TILED), "; GLB is written by convert and simplify"),
     (("cluster_sh",), ("RAD", "SOG"), "; name the output .rad, or add --format rad"),
     (
         (*parameters_of(DetailSettings), "environment", "environment_beyond"),

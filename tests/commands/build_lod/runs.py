@@ -15,6 +15,11 @@ def build(*arguments: object) -> int:
     return run(["build-lod", *map(str, arguments)])
 
 
+def convert(*arguments: object) -> int:
+    """Run `convert`, and return its exit status."""
+    return run(["convert", *map(str, arguments)])
+
+
 def sparklod(*arguments: object, **how: object) -> subprocess.CompletedProcess[bytes]:
     command = [sys.executable, "-m", "sparklod_cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, check=False, cwd=ROOT, **how)

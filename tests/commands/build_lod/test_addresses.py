@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("fsspec")
 
 from sparklod_cli.system.addresses import Address
-from tests.commands.build_lod.runs import SMALL, build
+from tests.commands.build_lod.runs import SMALL, build, convert
 from tests.conftest import FIXTURES, Capture
 
 pytestmark = pytest.mark.slow
@@ -59,18 +59,18 @@ def test_each_way_of_reading_is_possible(name: str, folder: Address, tmp_path: P
 def test_outputs_go_into_a_folder(folder: Address, tmp_path: Path) -> None:
     assert build(SMALL, "--output-dir", (folder / "web").url) == 0
     assert folder.files() == ["web/sh2-lod.spz"]
-    assert build((folder / "web/sh2-lod.spz").url, "--unlod", "-o", f"file://{tmp_path}/back.ply") == 0
+    assert convert((folder / "web/sh2-lod.spz").url, f"file://{tmp_path}/back.ply") == 0
     assert (tmp_path / "back.ply").is_file()
 
 
 def test_a_folder_of_sog_is_written(folder: Address) -> None:
     tree, meta = folder / "tree.spz", folder / "web/meta.json"
     assert build(SMALL, "-o", tree.url) == 0
-    assert build(tree.url, "--unlod", "-o", meta.url) == 0
+    assert convert(tree.url, meta.url) == 0
     names = ["means_l.webp", "means_u.webp", "meta.json", "quats.webp", "scales.webp", "sh0.webp"]
     assert meta.parent.files() == sorted([*names, "shN_centroids.webp", "shN_labels.webp"])
-    assert build(tree.url, "--unlod", "-o", meta.url) == 1
-    assert build(tree.url, "--unlod", "-o", meta.url, "-f") == 0
+    assert convert(tree.url, meta.url) == 1
+    assert convert(tree.url, meta.url, "-f") == 0
 
 
 def test_an_output_is_replaced_only_where_that_is_asked_for(scan: Address, capsys: Capture) -> None:

@@ -26,7 +26,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.progress import Progress
 from sparklod_cli.system.stdio import spooled
-from tests.commands.build_lod.runs import ONE, SMALL, build, sparklod
+from tests.commands.build_lod.runs import ONE, SMALL, build, convert, sparklod
 from tests.conftest import FIXTURES, ROOT, Capture
 from tests.signals import heed_signals
 
@@ -222,8 +222,8 @@ def test_a_process_reads_and_writes_pipes(tmp_path: Path) -> None:
 def test_the_leaves_of_a_piped_tree_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert build(SMALL, "-o", tmp_path / "tree.spz") == 0
     pipe(monkeypatch, (tmp_path / "tree.spz").read_bytes())
-    assert build("-", "--unlod", "-o", tmp_path / "piped.ply") == 0
-    assert build(tmp_path / "tree.spz", "--unlod", "-o", tmp_path / "named.ply") == 0
+    assert convert("-", tmp_path / "piped.ply") == 0
+    assert convert(tmp_path / "tree.spz", tmp_path / "named.ply") == 0
     assert (tmp_path / "piped.ply").read_bytes() == (tmp_path / "named.ply").read_bytes()
 
 

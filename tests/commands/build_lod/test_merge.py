@@ -154,7 +154,6 @@ def test_what_an_instance_says_to_viewers_is_said_to_be_left_out(
         (["a.ply", "b.ply", "--merge"], "--merge makes one file of all inputs; name it with --output"),
         (["--scene", "a.json"], "--scene makes one file of all inputs; name it with --output"),
         (["a.ply", "--merge", "--output-dir", "x"], "--output-dir cannot be used with --merge"),
-        (["a.ply", "--merge", "-o", "x.spz", "--unlod"], "--unlod cannot be used with --merge"),
         (["a.ply", "--merge", "-o", "x.spz", "--rgba", "c.npy"], "--rgba cannot be used with --merge"),
         (["a.ply", "--scene", "b.json", "-o", "x.spz"], "INPUT cannot be used with --scene, which names the files"),
         (["--merge", "-o", "x.spz"], "Missing argument 'INPUT...'"),

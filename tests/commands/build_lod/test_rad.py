@@ -16,7 +16,7 @@ from sparklod_cli.codecs.rad.rad_header import read_chunk_header, read_header
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
-from tests.commands.build_lod.runs import ONE, SMALL, build
+from tests.commands.build_lod.runs import ONE, SMALL, build, convert
 from tests.conftest import FIXTURES, Capture
 from tests.scenes import random_splats
 
@@ -136,7 +136,7 @@ def test_a_converted_tree_keeps_its_opacities(large: Path, tmp_path: Path) -> No
     """Scales are rounded to other codes; those of opacities are the same in both formats."""
     assert build(large, "-o", tmp_path / "there.rad") == 0
     assert build(tmp_path / "there.rad", "-o", tmp_path / "back.spz") == 0
-    assert build(tmp_path / "there.rad", "--unlod", "-o", tmp_path / "leaves.spz") == 0
+    assert convert(tmp_path / "there.rad", tmp_path / "leaves.spz", "--leaves") == 0
     before, there, back = (read_scene(path) for path in (large, tmp_path / "there.rad", tmp_path / "back.spz"))
     assert not np.array_equal(np.sort(before.splats.scale[:, 0]), np.sort(there.splats.scale[:, 0]))
     np.testing.assert_allclose(np.sort(there.splats.opacity), np.sort(before.splats.opacity), rtol=1e-5)
@@ -167,20 +167,16 @@ def test_a_tree_is_refused_where_nothing_is_to_be_converted(tmp_path: Path, caps
         assert build(TREE, "-o", tmp_path / name, *options) == 0
     whole, many = tmp_path / "tree.rad", tmp_path / "many.rad"
     refused = [
-        (TREE, [], "rad its tree as RAD"),
-        (TREE, ["--format", "spz"], "rad its tree as RAD"),
-        (TREE, ["--encoding", "ext"], "rad its tree as RAD"),
-        (whole, [], "spz its tree as SPZ"),
-        (whole, ["--format", "rad"], "spz its tree as SPZ"),
-        (many, ["--format", "rad-chunked"], "spz its tree as SPZ"),
-        (many, ["--encoding", "ext"], "spz its tree as SPZ"),
+        (TREE, []),
+        (TREE, ["--format", "spz"]),
+        (whole, []),
+        (whole, ["--format", "rad"]),
+        (many, ["--format", "rad-chunked"]),
     ]
     capsys.readouterr()
-    for source, options, hint in refused:
+    for source, options in refused:
         assert build(source, "--output-dir", tmp_path / "out", *options) == 1
-        said = (
-            f"it is a Level-of-Detail file already; --unlod writes its splats back out, and --format {hint}; --refine"
-        )
+        said = "it is a Level-of-Detail file already; sparklod convert writes its tree or its leaves in another format"
         assert said in capsys.readouterr().err
     for options in (
         ["--base", "1.5"],
@@ -219,14 +215,14 @@ def test_the_splats_of_a_rad_are_written_back_out(scene: Path, tmp_path: Path, c
     baked = read_scene(tmp_path / "scene-lod.rad")
     assert baked.tree is not None
     leaves = baked.splats.take(baked.tree.is_leaf)
-    for options, name in ((["--format", "rad"], "scene-unlod.rad"), ([], "scene-unlod.spz")):
-        assert build("--unlod", tmp_path / "scene-lod.rad", *options) == 0
+    for name in ("scene.rad", "scene.spz"):
+        assert convert(tmp_path / "scene-lod.rad", tmp_path / name, "--leaves") == 0
         back = read_scene(tmp_path / name)
         assert back.tree is None
         np.testing.assert_allclose(back.splats.center, leaves.center, atol=1e-3)
-    assert build("--unlod", tmp_path / "scene-lod.rad", "-o", tmp_path / "many.rad", "--format", "rad-chunked") == 0
+    assert convert(tmp_path / "scene-lod.rad", tmp_path / "many.rad", "--leaves", "--format", "rad-chunked") == 0
     assert read_scene(tmp_path / "many.rad").header["chunked"] == 1
-    assert build("--unlod", tmp_path / "scene-lod.rad", "-o", tmp_path / "back.ply") == 0
+    assert convert(tmp_path / "scene-lod.rad", tmp_path / "back.ply") == 0
     np.testing.assert_array_equal(read_scene(tmp_path / "back.ply").splats.center, leaves.center)
     capsys.readouterr()
 
@@ -268,12 +264,6 @@ def test_the_encoding_that_is_advised_holds_the_values(
         (["-o", "x.rad", "--fractional-bits", "9"], "--fractional-bits is an option of SPZ, not of RAD"),
         (["--rad-sh", "f16"], "--rad-sh is an option of RAD, not of SPZ; name the output .rad, or add --format rad"),
         (["-o", "x.spz", "--cluster-sh"], "--cluster-sh is an option of RAD and SOG, not of SPZ"),
-        (["--encoding", "ext", "--format", "rad"], "--format cannot be used with --encoding"),
-        (["--encoding", "ext", "--cluster-sh", "9"], "--cluster-sh is an option of RAD and SOG, not of --encoding"),
-        (["--encoding", "ext", "--compression-level", "9"], "an option of SPZ and RAD, not of --encoding"),
-        (["--unlod", "-o", "x.ply", "--rad-rgb", "f32"], "--rad-rgb is an option of RAD, not of PLY"),
-        (["--unlod", "-o", "x.ply", "--format", "rad"], "--format rad writes .rad, not .ply"),
-        (["--unlod", "-o", "x.splat", "--compression-level", "2"], "an option of SPZ and RAD, not of SPLAT"),
         (["--format", "rad", "--rad-center", "r8"], "--rad-center"),
         (["--format", "rad", "--cluster-sh", "1"], "2<=x<=65536"),
         (["--format", "rad", "--cluster-sh", "65537"], "2<=x<=65536"),
@@ -299,6 +289,6 @@ def test_chunks_of_an_input_are_not_replaced(tmp_path: Path, capsys: Capture) ->
     assert build(ONE, "--format", "rad-chunked", "-o", tmp_path / "a.rad") == 0
     moved = (tmp_path / "a.rad").rename(tmp_path / "b.rad")  # it still names a-0.radc
     before = (tmp_path / "a-0.radc").read_bytes()
-    assert build(moved, "--unlod", "--format", "rad-chunked", "-o", tmp_path / "a.rad", "--overwrite") == 2
+    assert convert(moved, tmp_path / "a.rad", "--leaves", "--format", "rad-chunked", "--overwrite") == 2
     assert "a-0.radc is an input; name another output" in capsys.readouterr().err
     assert (tmp_path / "a-0.radc").read_bytes() == before

@@ -81,7 +81,6 @@ def test_too_little_memory_is_an_error_that_says_how_much_is_enough(tmp_path: Pa
 @pytest.mark.parametrize(
     ("output", "options", "why"),
     [
-        ("a.npz", ["--encoding", "ext"], "--encoding writes arrays as a whole"),
         ("a.spz", ["--refine", "1"], "--refine fits a whole tree"),
         ("web/lod-meta.json", [], "detail levels are made of a whole tree"),
         ("web/tileset.json", [], "tiles are made of a whole tree"),
@@ -125,9 +124,6 @@ def test_standard_input_is_baked_out_of_core(
         (["--memory", "0B"], "'0B' must be positive"),
         (["--memory", "4"], "'4' has no unit; write 4G or 4MB"),
         (["--memory", "600000000"], "'600000000' has no unit"),
-        (["--unlod", "--memory", "1G"], "--memory cannot be used with --unlod"),
-        (["--unlod", "--resume"], "--resume cannot be used with --unlod"),
-        (["--unlod", "--skip-existing"], "--skip-existing cannot be used with --unlod"),
         (["-o", "-", "--skip-existing"], "--skip-existing needs an output that can be there already"),
         (["--scratch-dir", "-"], "it cannot go to standard output"),
     ],

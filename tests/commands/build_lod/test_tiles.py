@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.io.reading import read_parts, read_scene
-from tests.commands.build_lod.runs import SMALL, build
+from tests.commands.build_lod.runs import SMALL, build, convert
 from tests.commands.build_lod.test_streamed_sog import TREE, files, written
 from tests.conftest import Capture
 
@@ -84,7 +84,7 @@ def test_tiles_become_other_files(town: Path, tmp_path: Path) -> None:
     assert build(town, "-o", tmp_path / "tiles" / "tileset.json", "--tile-splats", 500) == 0
     leaves = len(read_scene(tmp_path / "tiles"))
     assert build(tmp_path / "tiles", "-o", tmp_path / "again.spz") == 0
-    assert build(tmp_path / "again.spz", "--unlod", "-o", tmp_path / "leaves.ply") == 0
+    assert convert(tmp_path / "again.spz", tmp_path / "leaves.ply") == 0
     assert len(read_scene(tmp_path / "leaves.ply")) == leaves
     assert build(tmp_path / "tiles" / "tileset.json", "-o", tmp_path / "web" / "lod-meta.json") == 0
 
@@ -123,7 +123,6 @@ def test_what_is_in_the_way_is_left(tmp_path: Path, capsys: Capture) -> None:
         (["--tile-splats", 0], "1 or more"),
         (["--levels", "50%"], "--levels is an option of Streamed SOG, not of 3D Tiles"),
         (["--spz-version", 2], "--spz-version is an option of SPZ, not of 3D Tiles"),
-        (["--unlod"], "--unlod writes splats without detail levels, not tileset.json"),
     ],
 )
 def test_wrong_usage(options: list[Any], message: str, tmp_path: Path, capsys: Capture) -> None:

@@ -16,7 +16,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.model.scene import AXES
-from tests.commands.build_lod.runs import SMALL, build
+from tests.commands.build_lod.runs import SMALL, build, convert
 from tests.conftest import Capture
 
 pytestmark = pytest.mark.slow
@@ -132,8 +132,8 @@ def test_whatever_is_made_of_a_file_has_its_axis(turned: Path, tmp_path: Path, c
         assert build(source, "-o", tmp_path / name, *options) == 0
     assert build(tmp_path / "a.rad", "-o", tmp_path / "d.spz") == 0
     for name in ("e.ply", "f.sog", "g.spz", "h.rad"):
-        assert build(tmp_path / "a.rad", "--unlod", "-o", tmp_path / name) == 0
-    assert build(tmp_path / "a.rad", "--unlod", "-o", tmp_path / "folder" / "meta.json") == 0
+        assert convert(tmp_path / "a.rad", tmp_path / name, "--leaves") == 0
+    assert convert(tmp_path / "a.rad", tmp_path / "folder" / "meta.json") == 0
     assert build(tmp_path / "e.ply", "-o", tmp_path / "i.spz") == 0
     assert build(tmp_path / "f.sog", "-o", tmp_path / "j.rad", "--rotate", "-90,0,0") == 0
     assert {path.name: read_scene(path).up for path in tmp_path.glob("?.*") if path.suffix != ".radc"} == {
@@ -145,17 +145,17 @@ def test_whatever_is_made_of_a_file_has_its_axis(turned: Path, tmp_path: Path, c
 
 
 def test_a_format_that_cannot_note_it_is_told(turned: Path, tmp_path: Path, capsys: Capture) -> None:
-    assert build(turned / "x.rad", "--unlod", "-o", tmp_path / "x.splat") == 0
+    assert convert(turned / "x.rad", tmp_path / "x.splat") == 0
     (option,) = re.findall(r"y is up, which this format cannot note; give (--up=y) to render", capsys.readouterr().err)
     output = tmp_path / "x.npy"
     assert psnr(render(DEMO, output), render(tmp_path / "x.splat", output, option)) > 35
-    assert build(turned / "x.rad", "--unlod", "-o", tmp_path / "x.ply") == 0
+    assert convert(turned / "x.rad", tmp_path / "x.ply") == 0
     assert "--up" not in capsys.readouterr().err
 
 
 def test_merged_files_have_an_axis_if_it_is_the_same_for_all(turned: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
-        assert build(turned / "x.rad", "--unlod", "-o", tmp_path / f"{name}.ply") == 0
+        assert convert(turned / "x.rad", tmp_path / f"{name}.ply") == 0
     paths = {"both": ("a.ply", "b.ply"), "one": ("a.ply", str(SMALL))}
     for name, files in paths.items():
         assert build(*(tmp_path / file for file in files), "--merge", "-o", tmp_path / f"{name}.spz") == 0

@@ -42,7 +42,6 @@ def test_scenes_side_by_side_are_those_of_one_after_the_other(tmp_path: Path) ->
     ("options", "said"),
     [
         (["--workers", 2, "--scheduler", "host:1"], "--workers cannot be used with --scheduler, whose workers run"),
-        (["--workers", 2, "--unlod"], "--workers cannot be used with --unlod"),
         (["--workers", 0], "0 is not in the range 1<=x<=256"),
     ],
 )

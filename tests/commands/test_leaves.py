@@ -16,7 +16,6 @@ from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
 
@@ -28,8 +27,8 @@ def tree_file(tmp_path: Path) -> Path:
     return path
 
 
-def unlod(*arguments: object) -> int:
-    return run(["build-lod", "--unlod", *map(str, arguments)])
+def convert(*arguments: object) -> int:
+    return run(["convert", *map(str, arguments)])
 
 
 def leaves(path: Path) -> Splats:
@@ -39,9 +38,9 @@ def leaves(path: Path) -> Splats:
 
 
 def test_spz_keeps_every_value_of_the_tree(tree_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert unlod(tree_file, "--json") == 0
+    assert convert(tree_file, tree_file.with_name("back.spz"), "--leaves", "--json") == 0
     record = json.loads(capsys.readouterr().out)
-    back = read_scene(tree_file.with_name("scene-unlod.spz"))
+    back = read_scene(tree_file.with_name("back.spz"))
     expected = leaves(tree_file)
     assert (back.format, back.antialiased, back.tree) == ("SPZ 2", True, None)
     assert (record["splats"], record["nodes"]) == (3000, len(read_scene(tree_file).splats))
@@ -54,7 +53,7 @@ def test_spz_keeps_every_value_of_the_tree(tree_file: Path, capsys: pytest.Captu
 
 
 def test_ply_keeps_them_as_floats(tree_file: Path, tmp_path: Path) -> None:
-    assert unlod(tree_file, "-o", tmp_path / "back.ply") == 0
+    assert convert(tree_file, tmp_path / "back.ply") == 0
     back, expected = read_scene(tmp_path / "back.ply"), leaves(tree_file)
     assert back.format == "PLY"
     for column in COLUMNS:
@@ -62,7 +61,7 @@ def test_ply_keeps_them_as_floats(tree_file: Path, tmp_path: Path) -> None:
 
 
 def test_splat_is_sorted_by_importance(tree_file: Path, tmp_path: Path) -> None:
-    assert unlod(tree_file, "-o", tmp_path / "back.splat") == 0
+    assert convert(tree_file, tmp_path / "back.splat") == 0
     expected = leaves(tree_file)
     expected = expected.take(importance_order(expected))
     np.testing.assert_array_equal(read_scene(tmp_path / "back.splat").splats.center, expected.center)
@@ -72,7 +71,7 @@ def test_what_splat_cannot_hold_is_said(tree_file: Path, tmp_path: Path, capsys:
     splats = random_splats(3000, sh_degree=1)
     splats.rgb[:1000] += 0.5
     tree_file.write_bytes(b"".join(spz.encode(Scene(*quick.build(splats)))))
-    assert unlod(tree_file, "-o", tmp_path / "back.splat") == 0
+    assert convert(tree_file, tmp_path / "back.splat") == 0
     said = capsys.readouterr().err
     expected = leaves(tree_file)
     beyond = (np.clip(expected.rgb, -0.5 / 255, 255.5 / 255) != expected.rgb).any(axis=1)
@@ -84,13 +83,13 @@ def test_what_splat_cannot_hold_is_said(tree_file: Path, tmp_path: Path, capsys:
 def test_nothing_is_said_where_nothing_is_lost(
     tree_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert unlod(tree_file, "-o", tmp_path / "back.ply") == 0
+    assert convert(tree_file, tmp_path / "back.ply") == 0
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 @pytest.mark.parametrize("name", ["back.sog", "web/meta.json"])
 def test_sog_holds_all_leaves(tree_file: Path, tmp_path: Path, name: str) -> None:
-    assert unlod(tree_file, "-o", tmp_path / name, "--cluster-sh", 3000) == 0
+    assert convert(tree_file, tmp_path / name, "--cluster-sh", 3000) == 0
     back, expected = read_scene(tmp_path / name), leaves(tree_file)
     assert (back.format, back.antialiased, back.header["palette"]) == ("SOG 2", True, 3000)
     for column in ("rgb", "opacity", "sh"):
@@ -106,21 +105,21 @@ def test_a_folder_of_sog_is_replaced_as_a_whole_or_not_at_all(
     meta.parent.mkdir()
     taken = meta.with_name("sh0.webp")
     taken.write_bytes(b"precious")
-    assert unlod(tree_file, "-o", meta) == 1
+    assert convert(tree_file, meta) == 1
     assert "sh0.webp exists, add --overwrite to replace it" in capsys.readouterr().err
     assert [each.name for each in meta.parent.iterdir()] == ["sh0.webp"]
-    assert unlod(tree_file, "-o", meta, "--overwrite") == 0
+    assert convert(tree_file, meta, "--overwrite") == 0
     assert meta.with_name("shN_labels.webp").exists()
     plain = tmp_path / "plain-lod.spz"
     plain.write_bytes(b"".join(spz.encode(Scene(*quick.build(random_splats(40))))))
-    assert unlod(plain, "-o", meta, "--overwrite") == 0
+    assert convert(plain, meta, "--overwrite") == 0
     names = ["means_l.webp", "means_u.webp", "meta.json", "quats.webp", "scales.webp", "sh0.webp"]
     assert sorted(each.name for each in meta.parent.iterdir()) == names  # those of SH are gone
     assert len(read_scene(meta)) == 40
 
 
 def test_fractional_bits_and_version_can_be_chosen(tree_file: Path, tmp_path: Path) -> None:
-    assert unlod(tree_file, "-o", tmp_path / "back.spz", "--spz-version", 3, "--fractional-bits", 8) == 0
+    assert convert(tree_file, tmp_path / "back.spz", "--leaves", "--spz-version", 3, "--fractional-bits", 8) == 0
     back = read_scene(tmp_path / "back.spz")
     assert (back.header["version"], back.header["fractional_bits"]) == (3, 8)
 
@@ -130,32 +129,5 @@ def test_leaves_that_cannot_be_drawn_are_written_too(tmp_path: Path) -> None:
     splats.opacity[:10] = 1e-4  # becomes 0 in the file
     scene = Scene(*quick.build(splats))
     (tmp_path / "scene-lod.spz").write_bytes(b"".join(spz.encode(scene)))
-    assert unlod(tmp_path / "scene-lod.spz") == 0
-    assert len(read_scene(tmp_path / "scene-unlod.spz").splats) == 50
-
-
-def test_a_file_without_a_tree_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert unlod(FIXTURES / "one.ply", "--output-dir", tmp_path) == 1
-    assert "it has no Level-of-Detail tree whose leaves could be written" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--base", "1.2"], "--base cannot be used with --unlod"),
-        (["--method", "quick"], "--method cannot be used with --unlod"),
-        (["--growth", "1.2"], "--growth cannot be used with --unlod"),
-        (["--rgba", "c.npy"], "--rgba cannot be used with --unlod"),
-        (["--encoding", "ext"], "--encoding cannot be used with --unlod"),
-        (["-o", "x.ksplat"], "--unlod writes .ply, .spz, .rad, .sog, meta.json, .glb, .splat, not .ksplat"),
-        (["-o", "x.json"], "--unlod writes .ply, .spz, .rad, .sog, meta.json, .glb, .splat, not .json"),
-        (["-o", "x.ply", "--cluster-sh"], "--cluster-sh is an option of RAD and SOG, not of PLY"),
-        (["-o", "x.ply", "--spz-version", "2"], "--spz-version is an option of SPZ, not of PLY"),
-    ],
-)
-def test_options_that_do_not_suit_unlod_are_refused(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert unlod("scene-lod.spz", *arguments) == 2
-    assert message in capsys.readouterr().err
+    assert convert(tmp_path / "scene-lod.spz", tmp_path / "back.spz", "--leaves") == 0
+    assert len(read_scene(tmp_path / "back.spz").splats) == 50
