@@ -16,11 +16,13 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+import sparklod_cli as sparklod
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
+from sparklod_cli.bake.converting import convert
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs import ply, spz
-from sparklod_cli.codecs.formats import ENCODINGS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
+from sparklod_cli.codecs.formats import ENCODINGS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_options
 from sparklod_cli.codecs.spark_codings import log_scale_table
@@ -200,15 +202,17 @@ def test_a_coordinate_is_written_up_to_the_last_but_one_code(bits: int | None, m
 
 
 @given(scenes(), st.sampled_from(METHODS), st.sampled_from(list(ENCODINGS)))
-def test_every_encoding_and_every_report_of_an_extreme_scene_is_made_without_a_warning(
-    splats: Splats, method: str, encoding: str
+def test_every_layout_and_every_report_of_an_extreme_scene_is_made_without_a_warning(
+    splats: Splats, method: str, layout: str
 ) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        source, output = file_of(folder, splats), Path(folder, "out")
+        source = file_of(folder, splats)
         try:
-            bake(source, output, BakeSettings(method=method, encoding=encoding))
+            tree = sparklod.build_lod(sparklod.read(source), method=method)
         except InvalidSplatsError as error:  # of which none can be seen
             assert refused(error)
+        else:
+            sparklod.pack(tree, layout)
         reported(source)
 
 
@@ -242,25 +246,28 @@ def raw_file(rng: np.random.Generator, kind: str) -> bytes:
     st.integers(0, 2**32 - 1),
     st.sampled_from([".ply", ".splat", ".ksplat"]),
     st.sampled_from(METHODS),
-    st.sampled_from([None, *ENCODINGS]),
+    st.sampled_from([None, ".npz", *WRITABLE]),
     st.booleans(),
 )
 @settings(max_examples=60)
 def test_any_numbers_are_baked_refused_and_reported_without_a_warning(
-    seed: int, kind: str, method: str, encoding: str | None, drop: bool
+    seed: int, kind: str, method: str, ending: str | None, drop: bool
 ) -> None:
     with np.errstate(all="ignore"):
         data = raw_file(np.random.default_rng(seed), kind)
     with tempfile.TemporaryDirectory() as folder:
         source, output = Path(folder, f"scene{kind}"), Path(folder, "out.spz")
         source.write_bytes(data)
-        how = BakeSettings(method=method, encoding=encoding, selection=Selection(drop_invalid=drop))
+        how = BakeSettings(method=method, suffix=ending or ".spz", selection=Selection(drop_invalid=drop))
         try:
-            bake(source, output, how)
+            if ending is None:
+                bake(source, output, how)
+            else:
+                convert(source, Path(folder, f"out{ending}"), how, layout="ext" if ending == ".npz" else None)
         except SparklodError as error:
             assert refused(error)
         else:
-            if encoding is None:
+            if ending is None:
                 assert [each for each in checked(output, source) if each.severity == ERROR] == []
         reported(source)
 

@@ -106,16 +106,6 @@ def test_a_choice_is_heeded(tmp_path: Path, stand_in: StandIn) -> None:
     assert read_scene(tmp_path / "fitted.rad").format == "RAD LoD"
 
 
-def test_arrays_can_be_made_of_a_tree_that_is_fitted(tmp_path: Path, stand_in: StandIn) -> None:
-    plain = tmp_path / "tree.spz"
-    bake(SOURCE, plain, PLAIN)
-    arrays = {}
-    for name, source in (("scene", SOURCE), ("tree", plain)):
-        baked = bake(source, tmp_path / f"{name}.npz", dataclasses.replace(REFINE, encoding="packed"))
-        arrays[name] = baked.arrays
-    assert arrays["scene"] == arrays["tree"] != {}
-
-
 def test_without_refining_a_tree_is_refused_as_ever(tmp_path: Path, stand_in: StandIn) -> None:
     plain = tmp_path / "tree.spz"
     bake(SOURCE, plain, PLAIN)
