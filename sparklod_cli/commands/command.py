@@ -49,7 +49,7 @@ ALIASES = {
     "bake": "build-lod",
     "build": "build-lod",
     "lod": "build-lod",
-    "unlod": "convert",
+    "unlod": "convert --leaves",
     "transcode": "convert",
     "export": "convert",
     "decimate": "simplify",

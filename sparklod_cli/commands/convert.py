@@ -10,7 +10,7 @@ import click
 from ..codecs.formats import ENCODINGS, MANIFEST, NPZ, RAW_SUFFIXES, TILESET, WRITABLE, ending_of
 from ..codecs.options import WriteOptions
 from ..system.addresses import Place
-from ..system.errors import FormatError, InvalidSplatsError, naming
+from ..system.errors import FormatError, InvalidSplatsError, OutOfMemoryError, naming
 from ..system.setting_fields import setting, setting_of
 from ..system.stdio import DASH, name_of
 from .build_lod import record_of, report_baked, report_converted
@@ -146,7 +146,7 @@ def convert(ctx: click.Context, /, **_: Any) -> None:
 
         settings = options.settings(ctx)
         console.announce_compiling()
-        with naming(name_of(source), (FormatError, InvalidSplatsError)):
+        with naming(name_of(source), (FormatError, InvalidSplatsError, OutOfMemoryError)):
             made = convert_file(
                 source,
                 target,

@@ -201,7 +201,7 @@ REPLACED = {
 def inspect(ctx: click.Context, /, **_: Any) -> None:
     """Report on splat files and check them.
 
-    Reads every format that build-lod reads, and the .npz files that build-lod --encoding writes; a FILE of - is
+    Reads every format that build-lod reads, and the .npz files that convert --layout writes; a FILE of - is
     standard input. Without --check or an expectation, prints a report. With them, prints a line for each finding;
     the exit status is 3 if one is an error (or a warning, with --fail-on warning).
 

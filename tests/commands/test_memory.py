@@ -66,7 +66,7 @@ COMMANDS = {
     "build-lod": (16, "build-lod HERE -o {out}.spz --threads 2"),
     "build-lod, one thread": (16, "build-lod HERE -o {out}.spz --threads 1"),
     "build-lod --method quality": (100, "build-lod HERE -o {out}.spz --method quality"),
-    "convert": (16, "convert HERE {out}.spz --leaves"),
+    "convert": (16, "convert HERE {out}.spz --leaves --overwrite"),
     "inspect": (16, "inspect HERE --stats --threads 2"),
     "inspect --check": (16, "inspect HERE --check"),
     "traverse": (16, "traverse HERE --budget 100 --orbit 2 -o {out}.csv"),
