@@ -73,7 +73,7 @@ def inspect_file(
 
 
 def picture_of(scene: Scene | None, by: str, depth: int | None) -> tuple[DescribedPicture | None, str | None]:
-    """Return the picture of the structure of a scene, see `tree_plot.plot`, or the reason why there is none."""
+    """Return the picture of a scene's structure, see `tree_plot.plot`, or else the reason why it cannot be drawn."""
     if scene is None:
         return None, "it does not hold all of its splats, so they cannot be drawn"
     from ..figures import tree_plot

@@ -14,12 +14,11 @@ from ..system.errors import FormatError, InvalidSplatsError, OutOfMemoryError, n
 from ..system.setting_fields import setting, setting_of
 from ..system.stdio import DASH, name_of
 from .build_lod import record_of, report_baked, report_converted
-from .command import COMMON, Command, check_declared, flag, flags_set, values_of
+from .command import COMMON, Command, check_declared, flag, values_of
 from .console import Console, print_json
 from .options.baking import (
     FILE_FORMAT,
     FORMS,
-    OF_SCENES,
     POSITION,
     SELECTION,
     BuildLodOptions,
@@ -36,6 +35,7 @@ from .paths import (
     claim_stdout,
     keep_apart,
     require_suffix,
+    stem_of,
     with_chunks,
 )
 
@@ -110,12 +110,11 @@ class ConvertOptions:
         form = self.output_form
         return BakeSettings(
             max_sh=self.max_sh,
-            **self.scene.settings(),
+            **self.scene.settings(ctx),
             suffix=form.suffix,
             options=write_options(self.written, self.cluster_sh, chunked=form.chunked),
             converts=True,
             recodes=True,
-            unused=tuple(flags_set(ctx, ("max_sh", *OF_SCENES))),
         )
 
 
@@ -175,7 +174,7 @@ def _name_in_folder(ctx: click.Context) -> str:
         raise click.UsageError(
             f"OUT is a folder; name the file in it, or add --format, such as {', '.join(TREE_FORMS)}"
         )
-    return f"{source.stem}{NAMES[form].suffix}"
+    return f"{stem_of(source)}{NAMES[form].suffix}"
 
 
 def _check(ctx: click.Context, options: ConvertOptions) -> None:

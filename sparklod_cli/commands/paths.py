@@ -108,7 +108,7 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
 
     Also if the suffix of an output is that of another format than the written one. Files themselves are compared, so
     that links and other spellings of a name do not matter. Pipes and devices are never replaced. `stands_for` has, by
-    the name of a parameter, further files: those that an input names, and those that are written into a folder.
+    the name of a parameter, further files: the files that an input names, and the files written into a folder.
     """
     stands_for = stands_for or {}
     inputs: list[Place] = []

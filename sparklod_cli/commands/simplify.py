@@ -29,7 +29,6 @@ from .options.baking import (
     EXAMPLE_STEPS,
     FILE_FORMAT,
     METHOD_OF_DETAIL,
-    OF_SCENES,
     POSITION,
     SELECTION,
     SPZ,
@@ -137,14 +136,13 @@ class SimplifyOptions:
             method=METHOD_OF_DETAIL,
             growth=DETAIL_GROWTH,
             max_sh=self.max_sh,
-            **self.scene.settings(),
+            **self.scene.settings(ctx),
             suffix=self.suffix,
             options=write_options(self.written, self.cluster_sh),
             simplify=SimplifyGoal(self.to, self.max_bytes, self.psnr),
             refine=None if self.refine is None else FitSettings(self.refine or None, self.seed, device=self.device),
             camera_path=self.camera_path,
             converts=True,
-            unused=tuple(flags_set(ctx, ("max_sh", *OF_SCENES))),
         )
 
 

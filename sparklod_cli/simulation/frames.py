@@ -131,8 +131,8 @@ class Simulation(StreamedCuts):
     ) -> tuple[MeasuredCut, NDArray[np.bool_], Row]:
         """Return the cut with the resident chunks, these chunks, and the cells of the row that describe chunks.
 
-        Without a stream there is no network: the chunks that fit the cache arrive at once, after so many bytes of
-        `headers`.
+        Without a stream there is no network: all chunks that fit the cache arrive at once. `headers` is the number of
+        bytes received before the first chunk.
         """
         requested, arrived, received, complete_in = ideal[0].wanted(), list[int](), headers, None
         if stream is None:

@@ -129,7 +129,7 @@ def setting_of(kind: type[Any], name: str, **attributes: Any) -> Any:
 
 
 def settings_in(kind: type[Any]) -> Iterator[tuple[dataclasses.Field[Any], Setting | None]]:
-    """Yield the fields of a dataclass that are options, and those that are groups of options, with None."""
+    """Yield each field of a dataclass that is an option, with its declaration, or a group of options, with None."""
     for each in dataclasses.fields(kind):
         declared = each.metadata.get(SETTING)
         if (declared is not None and not declared.only_api) or dataclasses.is_dataclass(each.default_factory):

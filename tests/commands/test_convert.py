@@ -174,3 +174,5 @@ def test_an_output_that_exists_is_kept(tmp_path: Path, capsys: Capture) -> None:
     assert convert(FIXTURES / "sh1.ply", target, "-fq") == 0
     assert convert(FIXTURES / "sh1.ply", tmp_path, "--format", "sog", "-q") == 0
     assert (tmp_path / "sh1.sog").read_bytes() == target.read_bytes()
+    assert convert(GOLDEN / "sh1-sog" / "meta.json", tmp_path, "--format", "ply", "-q") == 0
+    assert (tmp_path / "sh1-sog.ply").exists()  # named after its folder, as all outputs of an unpacked SOG

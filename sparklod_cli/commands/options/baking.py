@@ -145,7 +145,7 @@ class SceneOptions:
         heading=POSITION,
     )
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self, ctx: click.Context) -> dict[str, Any]:
         """Return the fields of `BakeSettings` for the scene; loads numpy."""
         from ...model.selection import Selection
 
@@ -170,15 +170,16 @@ class SceneOptions:
             max_box=self.max_box,  # type: ignore[arg-type]
             within=self.within,
         )
-        return {"selection": selection, "transform": transform, "up": self.up, "rgba": self.rgba}
+        unused = tuple(flags_set(ctx, OF_TREES))
+        return {"selection": selection, "transform": transform, "up": self.up, "rgba": self.rgba, "unused": unused}
 
 
-#: Parameters without an effect on the leaves of a tree.
-OF_SCENES = parameters_of(SceneOptions)
-OF_TREES = ("method", "max_sh", *(builder.setting for builder in BUILDERS.values()), *OF_SCENES)
+#: Parameters without an effect on an input that has a tree, of any command.
+_BUILT = ("method", "max_sh", *(builder.setting for builder in BUILDERS.values()))
+OF_TREES = (*_BUILT, *parameters_of(SceneOptions), "environment_beyond")
 
-#: Parameters of bakes out of core, and of bakes on several processes.
-OF_SCRATCH, OF_CLUSTERS = ("memory", "scratch_dir", "resume"), ("workers", "scheduler")
+#: Parameters of bakes on several processes.
+OF_CLUSTERS = ("workers", "scheduler")
 
 
 def write_options(options: WriteOptions, sh_codes: int | None, *, chunked: bool = False) -> WriteOptions:
@@ -392,7 +393,7 @@ class BuildLodOptions:
             base=self.base,
             growth=growth if self.growth is None else self.growth,
             max_sh=self.max_sh,
-            **self.input_scene.settings(),
+            **self.input_scene.settings(ctx),
             suffix=form.suffix,
             options=write_options(self.written, self.cluster_sh, chunked=form.chunked),
             detail=self.detail if form.cuts == DETAIL else None,
@@ -402,7 +403,6 @@ class BuildLodOptions:
             refine=refine,
             camera_path=self.camera_path,
             converts=self.form is not None or ending_of(self.name) in TREES or bool(form.cuts),
-            unused=tuple(flags_set(ctx, (*OF_TREES, "environment_beyond"))),
         )
 
 
