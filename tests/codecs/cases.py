@@ -1,19 +1,88 @@
-"""The input of the shared laws: a way to write a format, and the precision with which it keeps a scene."""
+"""What the tests of codecs share: ways to write a format, the precision of each, comparisons, and hard values."""
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
+from sparklod_cli.codecs.reader import decode_file
+from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.splats import COLUMNS, Splats
+from tests.scenes import random_splats
 
 Array = NDArray[np.float64]
 Content = bytes | dict[str, bytes]
+
+# --- Decoding, encoding, and comparisons ------------------------------------------------------------------------------
+
+
+def decode(codec: Any, data: bytes, **more: Any) -> Scene:
+    scene: Scene = decode_file(codec, io.BytesIO(data), **more)
+    return scene
+
+
+def encode(codec: Any, scene: Scene | Splats, options: WriteOptions = DEFAULTS, **more: Any) -> bytes:
+    return b"".join(codec.encode(scene if isinstance(scene, Scene) else Scene(scene), options, **more))
+
+
+def assert_same(found: Splats, expected: Splats, *, but: str = "") -> None:
+    """Assert that all columns are equal but one."""
+    for column in COLUMNS:
+        if column != but:
+            np.testing.assert_array_equal(getattr(found, column), getattr(expected, column), column)
+
+
+def rotation_degrees(one: NDArray[Any], other: NDArray[Any]) -> Array:
+    """(N,) angle of the rotation between two rotations; by the chord, which is exact for small angles."""
+    one, other = (quat / np.linalg.norm(quat, axis=1, keepdims=True) for quat in (one.astype(np.float64), other))
+    chord = np.minimum(np.linalg.norm(one - other, axis=1), np.linalg.norm(one + other, axis=1))
+    return np.degrees(4 * np.arcsin(chord / 2))
+
+
+def stated_degrees(decode: Callable[..., object]) -> float:
+    """What the docstring promises; so it cannot be wrong for long."""
+    match = re.search(r"Largest error: ([\d.]+) degrees", decode.__doc__ or "")
+    assert match
+    return float(match[1])
+
+
+# --- Splats and trees -------------------------------------------------------------------------------------------------
+
+
+def splats_with(count: int = 1, sh_degree: int = 0, **columns: Any) -> Splats:
+    splats = random_splats(count, sh_degree=sh_degree)
+    for name, values in columns.items():
+        getattr(splats, name)[:] = values
+    return splats
+
+
+def random_quats(count: int) -> NDArray[np.float32]:
+    """A quarter of them near half a turn, where an error of the axis counts most, and a quarter near no turn."""
+    quats = np.random.default_rng(5).normal(size=(count, 4))
+    quats[: count // 4, 3] *= 0.01
+    quats[-count // 4 :, :3] *= np.exp(np.linspace(-18, 0, count // 4))[:, None]
+    return np.ascontiguousarray(normalized_quat(quats.astype(np.float32)))
+
+
+def star(count: int) -> LodTree:
+    """The first node as the parent of all others."""
+    child_count, child_start = np.zeros(count, np.uint16), np.zeros(count, np.uint32)
+    if count > 1:
+        child_count[0], child_start[0] = count - 1, 1
+    return LodTree(child_count, child_start)
+
+
+# --- Ways to write a format -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -1,111 +1,54 @@
-"""Damaged bytes: a decoder gives a scene or a `FormatError`, and nothing else, quickly and in little memory."""
+"""Damaged bytes: a decoder gives a scene or a `FormatError`, and nothing else, quickly and in little memory.
+
+A stream of the same bytes fails with the same words, or gives the same splats.
+"""
 
 from __future__ import annotations
 
-import functools
 import gzip
 import io
+import itertools
+import json
 import struct
-import time
 import tracemalloc
-import zipfile
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
-from typing import BinaryIO
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from fixtures import by_hand, by_hand_sog
-from sparklod_cli.codecs.formats import FORMATS, HEAD, Format, sniff
-from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.system.errors import FormatError
+from sparklod_cli.codecs.formats import FORMATS, sniff
+from sparklod_cli.codecs.reader import OpenFile
+from sparklod_cli.model.splats import Splats
+from sparklod_cli.system.errors import FormatError, HasTreeError
+from tests.codecs.cases import assert_same, decode
+from tests.codecs.damage import (
+    FILES,
+    GZIPPED,
+    VALUES,
+    WORDS,
+    ZIPPED,
+    attempt,
+    companions,
+    content,
+    files_of,
+    format_of,
+    header,
+    insides,
+    members,
+    places_of,
+    replaced,
+)
 from tests.conftest import FIXTURES
 
-#: Files to damage: small ones of every kind that is read.
-FILES = (
-    "one.ply",
-    "sh1.ply",
-    "sh1-ascii.ply",
-    "sh1-big-endian.ply",
-    "golden/sh3-compressed.ply",
-    "golden/sh1-compressed-old.ply",
-    *(f"golden/hand-{name}.spz" for name in ("v1", "v2", "v3", "v4", "v4-sh4")),
-    *(f"golden/tree-v{version}.spz" for version in (2, 3)),
-    "golden/sh3-v2.sog",
-    "golden/sh2-v1.sog",
-    "golden/sh1-streamed-sog/lod-meta.json",
-    "golden/sh1-tiles/tileset.json",
-    *(f"golden/sh2-level{level}.ksplat" for level in (0, 1, 2)),
-    "golden/sh0.splat",
-    *("golden/sh1.hier", "golden/sh3-half.hier"),
-    *("golden/sh2-gsplat.pt", "golden/sh1-nerfstudio.ckpt"),
-    "golden/sh1-tree.rad",
-    *(f"golden/{name}.glb" for name in ("sh2", "sh1-quantized", "hand-spz", "sh1-draft", "parts")),
-    *("golden/sh2.gltf", "golden/sh1-gltf/scene.gltf"),
-)
-GZIPPED = tuple(name for name in FILES if name.endswith(".spz") and "v4" not in name)
-ZIPPED = tuple(name for name in FILES if name.endswith(".sog"))
-#: Bytes, and seconds of a processor, which are no fewer where other processes want it, too. A header may promise 64 MiB
-#: without being doubted.
-MEMORY, SECONDS = 2e8, 2.0
+#: Bytes; a header may promise 64 MiB without being doubted.
+MEMORY = 2e8
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("error")]  # they would go to standard error
+pytestmark = pytest.mark.filterwarnings("error")  # warnings would go to standard error
 
-
-@functools.cache
-def content(name: str) -> bytes:
-    return (FIXTURES / name).read_bytes()
-
-
-@functools.cache
-def files_of(name: str) -> dict[str, bytes]:
-    """All files of the folder of a manifest, and of the folders there."""
-    folder = (FIXTURES / name).parent
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.glob("*/*") if path.is_file()}
-
-
-def format_of(name: str, data: bytes) -> Format | None:
-    return sniff(data[:HEAD], Path(name).suffix)
-
-
-@functools.cache
-def _compile_kernels() -> None:
-    """Decodes a file of the format that needs kernels, which may have to be compiled: nothing that a file can help."""
-    form = format_of("golden/sh3-v2.sog", content("golden/sh3-v2.sog"))
-    assert form is not None
-    decode_file(form.codec(), io.BytesIO(content("golden/sh3-v2.sog")))
-
-
-def attempt(name: str, data: bytes, *, files: Mapping[str, bytes] | None = None, threads: int = 1) -> str:
-    """What comes of bytes in a file of this name, among others if need be: "scene" or the error's text."""
-    form = format_of(name, data)
-    if form is None:
-        return "unknown"
-
-    def open_companion(other: str) -> BinaryIO:
-        if other not in among:
-            raise FormatError("there is no such file")
-        return io.BytesIO(among[other])
-
-    among = files_of(name) if name and files is None and form.folders else files or {}
-
-    more = {"open_companion": open_companion} if form.companions else {}
-    _compile_kernels()
-    start = time.process_time()
-    try:
-        scene = decode_file(form.codec(), io.BytesIO(data), threads=threads, **more)
-    except FormatError as error:
-        assert "\n" not in str(error)
-        result = str(error)
-    else:
-        assert isinstance(scene, Scene)
-        if scene.tree:
-            scene.tree.validate()
-        result = "scene"
-    assert time.process_time() - start < SECONDS
-    return result
+# --- Decoding ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_files_are_of_every_format() -> None:
@@ -113,59 +56,30 @@ def test_the_files_are_of_every_format() -> None:
     assert [attempt(name, content(name)) for name in FILES] == ["scene"] * len(FILES)
 
 
-def header(name: str, data: bytes) -> list[int]:
-    """Where the bytes of a file are that say what the others mean."""
-    if name.endswith(".ply"):
-        return list(range(data.index(b"end_header\n") + 11))
-    if name.endswith(".ksplat"):
-        return [base + place for base in (0, 4096, 5120, 6144) for place in range(44)]
-    if name.endswith(".sog"):  # the end is the directory, which decides
-        return [*range(120), *range(len(data) - 400, len(data))]
-    if name.endswith(".glb"):
-        return list(range(28 + struct.unpack_from("<I", data, 12)[0]))
-    if name.endswith(".rad"):  # the file's, and that of the first chunk
-        return list(range(data.index(b"RADC") + 1200))
-    if name.endswith(".hier"):  # the number of splats, and the nodes without their boxes
-        count = struct.unpack_from("<i", data)[0]
-        nodes, node = (4 + 236 * count, 28) if count > 0 else (4 - 124 * count, 20)
-        return [*range(4), *range(nodes, nodes + 4 + node * struct.unpack_from("<i", data, nodes)[0])]
-    return list(range(len(data) if name.endswith(".json") else min(120, len(data))))
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_a_file_truncated_anywhere_is_refused(name: str) -> None:
     data = content(name)
-    places = {
-        *header(name, data),
-        *range(0, len(data), max(1, len(data) // 97)),
-        *range(len(data) - 9, len(data)),
-    }
+    spread, end = range(0, len(data), max(1, len(data) // 97)), range(len(data) - 9, len(data))
     harmless: Iterable[int] = ()
     if "ascii" in name:  # without its last newline, or a digit before it, it is still one of numbers
         harmless = range(data.rindex(b" ") + 2, len(data))
     elif name.endswith(".splat"):  # nothing says how many there should be
         harmless = range(0, len(data), 32)
-    for end in sorted(places - set(harmless)):
-        assert attempt(name, data[:end]) != "scene", end
+    for place in sorted({*header(name, data), *spread, *end} - set(harmless)):
+        assert attempt(name, data[:place]) != "scene", place
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_a_flipped_bit_gives_a_scene_or_a_format_error(name: str) -> None:
-    data = content(name)
-    rng = np.random.default_rng(10)
+    data, rng = content(name), np.random.default_rng(10)
     every = [8 * place + bit for place in header(name, data) for bit in range(8)]
     tries = 150 if name in ZIPPED else 400  # images take longer
-    bits = set(rng.choice(every, min(len(every), tries), replace=False)) | set(
-        rng.integers(0, 8 * len(data), tries // 2)
-    )
-    changed = bytearray(data)
-    refused = 0
+    bits = {*rng.choice(every, min(len(every), tries), replace=False), *rng.integers(0, 8 * len(data), tries // 2)}
     if not name.endswith(".ply"):  # a bit of the count is a promise of billions; tracing plyfile would take long
         tracemalloc.start()
-    for bit in sorted(bits):
-        changed[bit // 8] ^= 1 << bit % 8
-        refused += attempt(name, bytes(changed)) != "scene"
-        changed[bit // 8] ^= 1 << bit % 8
+    refused = sum(attempt(name, flipped(data, bit)) != "scene" for bit in sorted(bits))
     peak = tracemalloc.get_traced_memory()[1]  # 0 if nothing is traced
     tracemalloc.stop()
     assert peak < MEMORY
@@ -175,44 +89,24 @@ def test_a_flipped_bit_gives_a_scene_or_a_format_error(name: str) -> None:
         assert refused > 0.1 * len(bits)
 
 
-def insides(name: str) -> list[tuple[bytes, Callable[[bytes], bytes]]]:
-    """What lies under a file's checksums, part by part, and what puts the file together again around another part."""
-    if name in GZIPPED:
-        return [(gzip.decompress(content(name)), lambda data: gzip.compress(data, 1))]
-    if name in ZIPPED:
-        files = members(name)
-        return [
-            (data, lambda other, part=part: by_hand_sog.zipped(files | {part: other})) for part, data in files.items()
-        ]
-    return [(content(name), bytes)]
+def flipped(data: bytes, bit: int) -> bytes:
+    changed = bytearray(data)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
 
 
-@functools.cache
-def members(name: str) -> dict[str, bytes]:
-    with zipfile.ZipFile(io.BytesIO(content(name))) as archive:
-        return {part: archive.read(part) for part in archive.namelist()}
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*GZIPPED, *ZIPPED])
 def test_flipped_bits_under_a_valid_checksum_give_a_scene_or_a_format_error(name: str) -> None:
     """What a faulty writer could make: gzip or zip find nothing wrong with it."""
     rng = np.random.default_rng(15)
     for data, packed in insides(name):
-        changed = bytearray(data)
         first = range(8 * min(len(data), 400 if name in GZIPPED else 6))
         for bit in {*first, *(rng.integers(0, 8 * len(data), 30) if name in ZIPPED else ())}:
-            changed[bit // 8] ^= 1 << bit % 8
-            attempt(name, packed(bytes(changed)))
-            changed[bit // 8] ^= 1 << bit % 8
+            attempt(name, packed(flipped(data, bit)))
 
 
-WORDS = (
-    *(b"element ", b"vertex", b"property ", b"list uchar int ", b"format ascii 1.0\n", b"comment ", b"end_header\n"),
-    *(b"\n", b" ", b"-1", b"0", b"99999999999999999999", b"4294967295", b"1e999", b"\0", b"\xff", b"nan", b"inf"),
-    *(b"NaN", b"-Infinity", b"null", b"true", b'"', b"{", b"}", b"[", b"]", b",", b":", b'"count":', b'"files":["'),
-)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("seed", range(2))
 def test_inserted_deleted_or_changed_bytes_give_a_scene_or_a_format_error(name: str, seed: int) -> None:
@@ -240,6 +134,7 @@ def test_inserted_deleted_or_changed_bytes_give_a_scene_or_a_format_error(name: 
 NUMBERS = (np.nan, np.inf, -np.inf, 3e38, -3e38, 1e-45, 0.0, -1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("name", [name for name in FILES if name.endswith(("splat", "compressed.ply", "old.ply"))])
 def test_invalid_numbers_are_passed_on_without_a_warning(name: str, threads: int) -> None:
@@ -262,12 +157,10 @@ def test_invalid_numbers_are_passed_on_without_a_warning(name: str, threads: int
 MAGICS = (
     *(b"ply\n", b"ply\r", b"ply\nelement chunk 1\nelement vertex 1\nproperty uint packed_position\n"),
     *(b"\x1f\x8b\x08\0", b"NGSP", b"PK\x03\x04", b'{"quats":1, "means":', b'{"lodLevels":'),
-    b'{"asset":{},"geometricError":',
-    b'{"asset":{"version":"2.0"},"accessors":[',
+    *(b'{"asset":{},"geometricError":', b'{"asset":{"version":"2.0"},"accessors":['),
     b"PK\x03\x04" + bytes(26) + b"archive/data.pkl",
     *(b"\0\1\0\0\1\0\0\0", b"\0\1\0\0\3" + bytes(4091)),
-    *(b"RAD0", b"RAD0\40\0\0\0{", b"RADC"),
-    *(b"glTF", b"glTF\2\0\0\0"),
+    *(b"RAD0", b"RAD0\40\0\0\0{", b"RADC", b"glTF", b"glTF\2\0\0\0"),
 )
 
 
@@ -275,8 +168,9 @@ def test_every_format_with_a_magic_is_tried() -> None:
     assert {sniff(magic, "") for magic in MAGICS} == {form for form in FORMATS if not form.unmarked}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("magic", MAGICS)
-def test_random_bytes_after_a_magic_give_a_scene_or_a_format_error(magic: bytes) -> None:
+def test_random_bytes_after_a_magic_are_refused(magic: bytes) -> None:
     rng = np.random.default_rng(12)
     for size in (0, 1, 12, 40, 1000, 100_000):
         for _ in range(10):
@@ -286,8 +180,9 @@ def test_random_bytes_after_a_magic_give_a_scene_or_a_format_error(magic: bytes)
             assert attempt("", other) != "scene"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", sorted({suffix for form in FORMATS for suffix in form.suffixes}))
-def test_random_bytes_with_a_suffix_give_a_scene_or_a_format_error(suffix: str) -> None:
+def test_random_bytes_with_a_suffix_are_refused(suffix: str) -> None:
     rng = np.random.default_rng(14)
     for size in (0, 1, 12, 31, 33, 1000, 4097, 100_001):
         for _ in range(10):
@@ -297,6 +192,122 @@ def test_random_bytes_with_a_suffix_give_a_scene_or_a_format_error(suffix: str) 
 def test_a_header_without_its_splats_is_refused() -> None:
     for version in (1, 2, 3):
         for count in (0, 1, 1_000_000, 4_294_967_295):
-            result = attempt("", by_hand.spz_gzip(version, count, 3, 12, 0, []))
-            assert result == "scene" if count == 0 else result != "scene"
+            assert (attempt("", by_hand.spz_gzip(version, count, 3, 12, 0, [])) == "scene") == (count == 0)
     assert attempt("", by_hand.spz_zstd(4_294_967_295, 3, 12, 0, [b""] * 6)) != "scene"
+
+
+# --- SOG: a meta.json that says anything else, and images that are something else -------------------------------------
+
+SOG = "golden/sh1-sog/meta.json"
+SOG_FILES = {path.name: path.read_bytes() for path in (FIXTURES / SOG).parent.iterdir()}
+
+
+@pytest.mark.parametrize("name", [SOG, *ZIPPED])
+def test_a_changed_meta_json_gives_a_scene_or_a_format_error(name: str) -> None:
+    files = SOG_FILES if name == SOG else members(name)
+    meta = json.loads(files["meta.json"])
+    refused = tried = 0
+    for number, path in enumerate(places_of(meta)[1:]):
+        for value in (..., *VALUES)[number % 3 :: 3]:  # all of them at neighbouring places
+            text = json.dumps(replaced(meta, path, value)).encode()
+            data = text if name == SOG else by_hand_sog.zipped(files | {"meta.json": text})
+            refused += attempt(name, data, files=files, threads=1 + tried % 2) != "scene"
+            tried += 1
+    assert refused > 0.5 * tried
+
+
+@pytest.mark.parametrize("part", ["means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp"])
+def test_changed_swapped_or_missing_images_give_a_scene_or_a_format_error(part: str) -> None:
+    meta, whole = SOG_FILES["meta.json"], SOG_FILES[part]
+    assert attempt(SOG, meta, files=SOG_FILES) == "scene"
+    assert attempt(SOG, meta, files={name: data for name, data in SOG_FILES.items() if name != part}) != "scene"
+    others = [meta, b"GIF89a" + bytes(99), content("one.ply"), by_hand_sog.flat_webp(4, 4)]
+    for other in [*others, *(whole[:end] for end in range(0, len(whole), 5))]:
+        assert attempt(SOG, meta, files=SOG_FILES | {part: other}) != "scene"
+    attempt(SOG, meta, files=SOG_FILES | {part: SOG_FILES["shN_centroids.webp"]})
+
+
+# --- Streams ----------------------------------------------------------------------------------------------------------
+
+
+def outcome(make: Callable[[], Splats]) -> Splats | str | None:
+    """The splats, or what is wrong; None for a tree."""
+    try:
+        return make()
+    except HasTreeError:
+        return None
+    except FormatError as error:
+        return f"{type(error).__name__}: {error}"
+
+
+def compare(name: str, data: bytes) -> str:
+    """What both come to: "tree", "splats" or the error's text."""
+    form = format_of(name, data)
+    if form is None:
+        return "unknown"
+    codec: Any = form.codec()
+    more = companions(form, files_of(name)) if form.folders else {}
+
+    def in_memory(pieces: Callable[[], Iterable[bytes]]) -> OpenFile:
+        return OpenFile(io.BytesIO(b"".join(pieces())))
+
+    def streamed() -> Splats:
+        reader = codec.open_content(OpenFile(io.BytesIO(data), scratch=in_memory, **more))
+        return Splats.concat([Splats.empty(0, reader.sh_degree), *reader.blocks()])
+
+    whole, found = outcome(lambda: decode(codec, data, **more).splats), outcome(streamed)
+    if found is None:
+        return "tree"
+    if isinstance(whole, Splats) and isinstance(found, Splats):
+        assert_same(found, whole)
+        return "splats"
+    assert found == whole
+    return str(found)
+
+
+def damaged(name: str, rng: np.random.Generator) -> Iterable[bytes]:
+    """The bytes of a file as they are, cut short, with other bits, and with words in between."""
+    data, packed = insides(name)[0]  # of SOG, meta.json
+    yield packed(data)
+    for raw, rest in ((content(name), bytes), (data, packed)):
+        places = header(name, raw) if raw is not data or rest is bytes else list(range(len(raw)))
+        for kind in range(40):
+            changed = bytearray(raw)
+            at = int(rng.choice(places)) if kind % 2 else int(rng.integers(len(raw)))
+            at = min(at, len(raw) - 1)
+            if kind % 4 == 0:
+                del changed[at:]
+            elif kind % 4 == 1:
+                changed[at:at] = WORDS[rng.integers(len(WORDS))]
+            else:
+                changed[at] ^= 1 << int(rng.integers(8))
+            yield rest(bytes(changed))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_stream_of_damaged_bytes_fails_as_the_decoder_does(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sparklod_cli.codecs.reader.BLOCK_SPLATS", 20)
+    rng = np.random.default_rng([17, len(name)])
+    found = [compare(name, data) for data in damaged(name, rng)]
+    assert found[0] == ("tree" if "tree" in name else "splats")
+    assert name.endswith(".splat") or any(text not in ("tree", "splats", "unknown") for text in found)
+
+
+@pytest.mark.parametrize("name", ZIPPED)
+def test_of_two_faults_a_stream_of_sog_finds_the_one_that_the_decoder_does(name: str) -> None:
+    """Images are read in an order of their own; a label beyond the palette is found in an image that is whole."""
+    files = members(name)
+    images = [part for part in files if part != "meta.json"]
+    labels = json.loads(files["meta.json"])["shN"]["files"][1]
+    with Image.open(io.BytesIO(files[labels])) as image:
+        beyond = np.full((image.height, image.width, 4), 255, np.uint8)
+    faults = [{part: b"GIF89a" + bytes(99)} for part in images]
+    faults += [{part: files[part][: len(files[part]) // 2]} for part in images]
+    faults += [{labels: by_hand_sog.webp(beyond)}]
+    texts = {
+        compare(name, by_hand_sog.zipped(files | first | second))
+        for first, second in itertools.combinations(faults, 2)
+        if first.keys() != second.keys()
+    }
+    assert len(texts) > len(images)
+    assert compare(name, by_hand_sog.zipped(files | faults[-1])).startswith("FormatError: an SH label")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from sparklod_cli.codecs import spark_codings
 from sparklod_cli.codecs.spark_codings import STEPS_8_8_8, STEPS_10_10_12
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.system.errors import FormatError
+from tests.codecs.cases import random_quats, rotation_degrees
 
 Steps = tuple[int, int]
 BOTH = pytest.mark.parametrize("steps", [STEPS_8_8_8, STEPS_10_10_12])
@@ -29,23 +31,8 @@ def stated_degrees(steps: Steps) -> float:
     return float(match[1])
 
 
-def degrees_between(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """(N,) angle of the rotation between two; by the chord, which is exact for small angles."""
-    one, other = (quat / np.linalg.norm(quat, axis=1, keepdims=True) for quat in (one.astype(float), other))
-    chord = np.minimum(np.linalg.norm(one - other, axis=1), np.linalg.norm(one + other, axis=1))
-    return np.degrees(4 * np.arcsin(chord / 2))
-
-
 def round_trip(quats: np.ndarray, steps: Steps) -> np.ndarray:
     return spark_codings.decode_axis_angle(*spark_codings.encode_axis_angle(quats, steps), steps)
-
-
-def random_quats(count: int) -> np.ndarray:
-    """A quarter of them near half a turn, where an error of the axis counts most, and a quarter near no turn."""
-    quats = np.random.default_rng(5).normal(size=(count, 4))
-    quats[: count // 4, 3] *= 0.01
-    quats[-count // 4 :, :3] *= np.exp(np.linspace(-18, 0, count // 4))[:, None]
-    return np.ascontiguousarray(normalized_quat(quats.astype(np.float32)))
 
 
 # --- Rotations --------------------------------------------------------------------------------------------------------
@@ -57,17 +44,17 @@ def test_rotations_keep_and_reach_their_error(steps: Steps) -> None:
     middles = np.arange(steps[0]) + 0.5
     u, v = (grid.ravel() for grid in np.meshgrid(middles, middles))
     between = spark_codings.decode_axis_angle(u, v, np.full(u.size, steps[1] - 0.5), steps)
-    error = degrees_between(between, round_trip(between, steps)).max()
+    error = rotation_degrees(between, round_trip(between, steps)).max()
     assert 0.99 * stated_degrees(steps) <= error <= stated_degrees(steps)
     quats = random_quats(200_000)
-    assert degrees_between(quats, round_trip(quats, steps)).max() <= stated_degrees(steps)
+    assert rotation_degrees(quats, round_trip(quats, steps)).max() <= stated_degrees(steps)
 
 
 @BOTH
 @given(quats=arrays(np.float32, (20, 4), elements=st.floats(-1, 1, width=32)))
 def test_any_rotation_keeps_its_error(steps: Steps, quats: np.ndarray) -> None:
     quats = np.ascontiguousarray(normalized_quat(quats[np.abs(quats).max(axis=1) > 0]))
-    assert degrees_between(quats, round_trip(quats, steps)).max(initial=0) <= stated_degrees(steps)
+    assert rotation_degrees(quats, round_trip(quats, steps)).max(initial=0) <= stated_degrees(steps)
 
 
 @BOTH
@@ -75,7 +62,7 @@ def test_angles_are_off_by_half_a_step(steps: Steps) -> None:
     """A turn about an axis that is coded exactly loses the angle's error alone."""
     angle = np.linspace(0.5, np.pi, 100_001)
     quats = np.stack([0 * angle, 0 * angle, -np.sin(angle / 2), np.cos(angle / 2)], axis=1).astype(np.float32)
-    error = degrees_between(quats, round_trip(quats, steps)).max()
+    error = rotation_degrees(quats, round_trip(quats, steps)).max()
     half_step = np.degrees(np.pi / 2 / steps[1])
     assert 0.99 * half_step <= error <= 1.001 * half_step
 
@@ -97,7 +84,7 @@ def test_two_codes_on_the_rim_mean_one_rotation(steps: Steps) -> None:
     v = np.arange(most + 1)
     rim = spark_codings.decode_axis_angle(np.full(v.size, most), v, np.full(v.size, steps[1]), steps)
     np.testing.assert_allclose(rim, rim[::-1], atol=1e-6)
-    assert degrees_between(rim, round_trip(rim, steps)).max() < 1e-3
+    assert rotation_degrees(rim, round_trip(rim, steps)).max() < 1e-3
 
 
 @BOTH
@@ -140,12 +127,10 @@ def test_small_turns_keep_their_axis() -> None:
 
 # --- Rounding and alpha -----------------------------------------------------------------------------------------------
 
-NUMBERS = [0, 0.49999997, 0.5, 0.50000006, 1.5, 2.4999998, 2.5, 126.5, 254.49998, 254.5]
-
 
 def test_ties_go_away_from_zero() -> None:
+    values = np.array([0, 0.49999997, 0.5, 0.50000006, 1.5, 2.4999998, 2.5, 126.5, 254.49998, 254.5], np.float32)
     expected = [0, 0, 1, 1, 2, 2, 3, 127, 254, 255]
-    values = np.array(NUMBERS, np.float32)
     np.testing.assert_array_equal(spark_codings.round_half_away(values), expected)
     np.testing.assert_array_equal(spark_codings.round_half_away(-values), np.negative(expected))
     np.testing.assert_array_equal(spark_codings.to_code(values, 255), expected)
@@ -173,17 +158,19 @@ def test_decoding_lod_alpha_gives_the_opacity_back(opacity: np.ndarray) -> None:
 # --- Checks of arrays -------------------------------------------------------------------------------------------------
 
 
+TWO, FOUR = np.zeros((3, 2), np.uint32), np.zeros((3, 4), np.uint32)
+
+
 @pytest.mark.parametrize(
     ("arrays", "text"),
     [
         ({}, "no array b, only none"),
-        ({"a": np.zeros((3, 2), np.uint32)}, "no array b, only a"),
+        ({"a": TWO}, "no array b, only a"),
         ({"b": np.zeros((3, 4), np.int32)}, r"b is int32\[3, 4\], expected uint32\[3, 4\]"),
-        ({"b": np.zeros((3, 5), np.uint32)}, r"expected uint32\[3, 4\]"),
         ({"b": np.zeros(12, np.uint32)}, r"b is uint32\[12\], expected uint32\[12, 4\]"),
         ({"b": np.uint32(0)}, r"b is uint32\[\]"),
-        ({"b": np.zeros((3, 4), np.uint32), "a": np.zeros((4, 2), np.uint32)}, r"a is .*, expected uint32\[3, 2\]"),
-        ({"b": np.zeros((0, 4), np.uint32), "a": np.zeros((4, 2), np.uint32)}, r"a is .*, expected uint32\[0, 2\]"),
+        ({"b": FOUR, "a": FOUR}, r"a is .*, expected uint32\[3, 2\]"),
+        ({"b": FOUR[:0], "a": TWO}, r"a is .*, expected uint32\[0, 2\]"),
     ],
 )
 def test_wrong_arrays_are_named(arrays: dict[str, np.ndarray], text: str) -> None:
@@ -245,20 +232,18 @@ def test_logarithms_are_within_a_unit_of_the_last_place() -> None:
     assert 0.001 < apart.mean() < 0.05
 
 
-@pytest.mark.parametrize(("value", "expected"), [(np.inf, np.inf), (-np.inf, 0), (100, np.inf), (-110, 0), (0, 1)])
-def test_exponentials_of_the_ends(value: float, expected: float) -> None:
-    assert spark_codings.exp(np.array([value], np.float32)).tolist() == [expected]
+EXP, LOG = spark_codings.exp, spark_codings.log
 
 
-@pytest.mark.parametrize(("value", "expected"), [(np.inf, np.inf), (0, -np.inf), (1, 0)])
-def test_logarithms_of_the_ends(value: float, expected: float) -> None:
-    assert spark_codings.log(np.array([value], np.float32)).tolist() == [expected]
-
-
-def test_what_is_no_number_stays_none() -> None:
-    values = np.array([np.nan, -1], np.float32)
-    assert np.isnan(spark_codings.log(values)).all()
-    assert np.isnan(spark_codings.exp(values[:1])).all()
+@pytest.mark.parametrize(
+    ("function", "values", "expected"),
+    [
+        (EXP, [np.inf, -np.inf, 100, -110, 0, np.nan], [np.inf, 0, np.inf, 0, 1, np.nan]),
+        (LOG, [np.inf, 0, 1, np.nan, -1], [np.inf, -np.inf, 0, np.nan, np.nan]),
+    ],
+)
+def test_ends_of_exponentials_and_logarithms(function: Callable, values: list[float], expected: list[float]) -> None:
+    np.testing.assert_array_equal(function(np.array(values, np.float32)), expected)
 
 
 def test_exponential_and_logarithm_are_those_of_msun() -> None:

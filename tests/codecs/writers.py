@@ -33,9 +33,18 @@ from sparklod_cli.model import morton
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
 from sparklod_cli.model.splats import Splats
-from tests.codecs.cases import Array, Case, Content, Precision, exact, largest_dropped_degrees, linear, rounding
+from tests.codecs.cases import (
+    Array,
+    Case,
+    Content,
+    Precision,
+    exact,
+    largest_dropped_degrees,
+    linear,
+    rounding,
+    stated_degrees,
+)
 from tests.codecs.rad.ways import RAD
-from tests.codecs.test_quantize import stated_degrees
 
 # --- PLY --------------------------------------------------------------------------------------------------------------
 

@@ -17,7 +17,7 @@ from sparklod_cli.model.gaussian import linear_opacity, lod_opacity
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import FormatError
 from sparklod_cli.system.threads import BLOCK_ROWS
-from tests.codecs.test_spark_codings import degrees_between, random_quats
+from tests.codecs.cases import random_quats, rotation_degrees
 from tests.scenes import random_splats
 
 HALF = 2.0**-11  # relative rounding error of a float16
@@ -135,7 +135,7 @@ def test_logarithms_of_scales_keep_the_precision_of_float16(low: float, high: fl
 
 def test_rotations_are_off_by_less_than_half_a_degree() -> None:
     quats = random_quats(100_000)
-    error = degrees_between(quats, round_trip(splats_with(len(quats), quat_xyzw=quats)).quat_xyzw).max()
+    error = rotation_degrees(quats, round_trip(splats_with(len(quats), quat_xyzw=quats)).quat_xyzw).max()
     assert 0.95 * 0.476 <= error <= 0.476
 
 

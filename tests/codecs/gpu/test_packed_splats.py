@@ -20,7 +20,7 @@ from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import FormatError
 from sparklod_cli.system.threads import BLOCK_ROWS
-from tests.codecs.test_spark_codings import degrees_between, random_quats
+from tests.codecs.cases import random_quats, rotation_degrees
 from tests.scenes import random_splats
 
 ROUNDING = 1.001  # float32's own errors, which no docstring counts
@@ -135,7 +135,7 @@ def test_logarithms_of_scales_are_within_half_a_step_of_their_range(encoding: Sp
 
 def test_rotations_are_off_by_less_than_two_degrees() -> None:
     quats = random_quats(100_000)
-    error = degrees_between(quats, round_trip(splats_with(len(quats), quat_xyzw=quats)).quat_xyzw).max()
+    error = rotation_degrees(quats, round_trip(splats_with(len(quats), quat_xyzw=quats)).quat_xyzw).max()
     assert 0.95 * 1.94 <= error <= 1.94
 
 

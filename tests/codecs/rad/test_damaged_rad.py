@@ -19,8 +19,7 @@ from sparklod_cli.codecs.rad.property_codings import CODINGS
 from sparklod_cli.codecs.rad.rad_header import read_header
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.system.errors import FormatError, PromiseError
-from tests.codecs.sog.test_damaged import VALUES, places_of, replaced
-from tests.codecs.test_damaged import attempt, content
+from tests.codecs.damage import VALUES, attempt, content, places_of, replaced
 from tests.conftest import FIXTURES
 
 WHOLE = "golden/sh1-tree.rad"

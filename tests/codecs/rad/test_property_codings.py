@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fixtures import by_hand_rad
 from sparklod_cli.codecs.options import AUTO, RAD_ENCODINGS, RadOptions
 from sparklod_cli.codecs.rad.property_codings import CODINGS, LARGEST_F16, PROPERTIES
-from tests.codecs.test_quantize import rotation_degrees
+from tests.codecs.cases import rotation_degrees
 from tests.scenes import random_splats
 
 Array = NDArray[np.float32]

@@ -19,8 +19,7 @@ from sparklod_cli.codecs.rad.rad_header import ENCODING_KEYS
 from sparklod_cli.codecs.rad.rad_options import HALF
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.model.scene import Scene
-from tests.codecs.cases import Array, Case, Content, Precision, linear
-from tests.codecs.test_quantize import stated_degrees
+from tests.codecs.cases import Array, Case, Content, Precision, linear, stated_degrees
 
 #: Two sets of encodings that have each one between them.
 PLAIN_RAD = {

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from sparklod_cli.codecs.sog import texel_codings as codings
 from sparklod_cli.codecs.sog.texel_codings import CODES, codebook, even_codebook, nearest
 from sparklod_cli.model.gaussian import normalized_quat
-from tests.codecs.test_quantize import rotation_degrees, stated_degrees
+from tests.codecs.cases import rotation_degrees, stated_degrees
 from tests.references.sog_quats import decode_quat
 
 

@@ -22,7 +22,7 @@ from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import linear
-from tests.codecs.test_round_trip import assert_close
+from tests.codecs.test_laws import assert_close
 from tests.codecs.writers import sog_precision
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats

@@ -14,8 +14,7 @@ import pytest
 
 from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.system.errors import FormatError
-from tests.codecs.sog.test_damaged import VALUES, places_of, replaced
-from tests.codecs.test_damaged import attempt, content, files_of
+from tests.codecs.damage import VALUES, attempt, content, files_of, places_of, replaced
 
 from .scenes import open_companion
 
