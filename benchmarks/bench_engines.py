@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from sparklod_cli.codecs.formats import TILESET
-from sparklod_cli.codecs.tiles_3d.tileset import to_tileset
+from sparklod_cli.codecs.tileset import to_tileset
 from sparklod_cli.io.reading import read_scene
 from tests.interop.engines.browser import Browser, Shown
 from tests.interop.engines.likeness import like_cesium, likeness, our_picture

@@ -22,7 +22,7 @@ from sparklod_cli import Splats
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.model.sh import COEFFICIENTS

@@ -35,10 +35,10 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .cameras.sources import CameraPath as CameraPath
     from .codecs.options import RadOptions as RadOptions
     from .codecs.options import SogOptions as SogOptions
-    from .codecs.rad.codec import RadChunk as RadChunk
     from .codecs.rad.rad_header import RadChunkEntry as RadChunkEntry
     from .codecs.rad.rad_header import RadChunkHeader as RadChunkHeader
     from .codecs.rad.rad_header import RadHeader as RadHeader
+    from .codecs.rad.rad_writer import RadChunk as RadChunk
     from .codecs.spark_codings import SplatEncoding as SplatEncoding
     from .fitting.settings import FitSettings as FitSettings
     from .fitting.settings import Refined as Refined

@@ -24,7 +24,7 @@ from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs import ply, spz
 from sparklod_cli.codecs.formats import ENCODINGS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import rad_options
+from sparklod_cli.codecs.rad import rad_writer as rad_options
 from sparklod_cli.codecs.spark_codings import log_scale_table
 from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding

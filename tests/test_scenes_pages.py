@@ -12,7 +12,7 @@ import pytest
 from sparklod_cli.cameras import framing
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.foveation import Frustum

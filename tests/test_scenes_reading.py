@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.codecs.options import DEFAULTS
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.gaussian import moved, placed, spark_size

@@ -10,7 +10,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sparklod_cli.codecs.formats import TILESET
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.codecs.tiles_3d.codec import encode_files
+from sparklod_cli.codecs.tiles_3d import encode_files
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import parts, quality
 from sparklod_cli.lod.part_settings import TileSettings

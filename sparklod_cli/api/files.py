@@ -21,8 +21,8 @@ from .arguments import ProgressLike, progress_callback, scene_like
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..codecs.rad.codec import RadChunk
     from ..codecs.rad.rad_header import RadHeader
+    from ..codecs.rad.rad_writer import RadChunk
     from ..inspection.report import Report
 
 #: Errors of public functions that begin with the name of the file.

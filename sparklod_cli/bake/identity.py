@@ -18,7 +18,8 @@ import numpy as np
 from .. import __version__
 from ..cameras.formats.table import NAMES
 from ..io.local_files import companions
-from ..io.reading import Source, file_of, placement_of, places_of, readable
+from ..io.opening import file_of, readable
+from ..io.reading import Source, placement_of, places_of
 from ..model.transforms import Transform
 from ..system.addresses import Address, Place
 from ..system.errors import UnreadableError

@@ -87,7 +87,7 @@ def write_levels(
     Args:
         end: called with the name of each stage before the last one, when it is done.
     """
-    from ..codecs.streamed_sog.codec import encode_files
+    from ..codecs.streamed_sog import encode_files
     from ..lod.parts import make_levels
 
     assert scene.tree is not None
@@ -121,7 +121,7 @@ def write_tiles(
     progress: Progress,
 ) -> tuple[int, WrittenTiles]:
     """Make the tiles of a tree and write them as 3D Tiles; see `write_levels`."""
-    from ..codecs.tiles_3d.codec import encode_files
+    from ..codecs.tiles_3d import encode_files
     from ..lod.parts import make_tiles
 
     assert scene.tree is not None

@@ -13,7 +13,8 @@ from ..codecs.encoder import CLAMPED, results, windows_of
 from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
-from ..io.reading import Merged, Source, opened, read_stored
+from ..io.opening import opened
+from ..io.reading import Merged, Source, read_stored
 from ..io.writing import parts_output, scene_output
 from ..model.scene import Scene
 from ..model.splats import Splats, same_rows

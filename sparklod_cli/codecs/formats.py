@@ -95,10 +95,10 @@ FORMATS = (
     # Gzipped up to version 3.
     Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", (".spz",), trees=True),
     # RADC begins a chunk, which the codec refuses with what to give instead.
-    Format(RAD, "rad.codec", (".rad",), rb"RAD[0C]", (".rad",), trees=True, companions=True),
+    Format(RAD, "rad.rad_writer", (".rad",), rb"RAD[0C]", (".rad",), trees=True, companions=True),
     Format(
         "Streamed SOG",
-        "streamed_sog.codec",
+        "streamed_sog",
         (".json",),
         None,
         companions=True,
@@ -108,7 +108,7 @@ FORMATS = (
     ),
     Format(
         "3D Tiles",
-        "tiles_3d.codec",
+        "tiles_3d",
         (".json",),
         None,
         companions=True,
@@ -119,7 +119,7 @@ FORMATS = (
     # The same as JSON, whose keys stand in any order; a meta.json of SOG is JSON, too.
     Format(
         "glTF",
-        "glb.codec",
+        "gltf",
         (".gltf",),
         rb"(?:\xef\xbb\xbf)?\s*\{.*?\"(?:accessors|bufferViews|buffers|meshes)\"\s*:\s*\[",
         companions=True,
@@ -138,7 +138,7 @@ FORMATS = (
         companions=True,
         keys=("means", "quats"),
     ),
-    Format("GLB", "glb.codec", (".glb",), rb"glTF", (".glb",), companions=True, folders=True),
+    Format("GLB", "gltf", (".glb",), rb"glTF", (".glb",), companions=True, folders=True),
     # Version 0.1 on, as a float denormal, and fewer than 2 ** 24 sections, which as a float would be, too.
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0...\0"),
     Format("HIER", "hier", (".hier",), None),

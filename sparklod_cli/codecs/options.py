@@ -52,7 +52,7 @@ RAD_CHOICES = {name: (AUTO, *encodings) for name, encodings in RAD_ENCODINGS.ite
 
 @dataclass(frozen=True)
 class RadOptions(CheckedSettings):
-    """Options of RAD files; encodings are explained in `rad_options`.
+    """Options of RAD files; encodings are explained in `rad.property_codings`.
 
     Attributes:
         chunked: write each chunk into a file of its own.

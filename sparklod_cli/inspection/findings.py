@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from ..codecs import streamed_manifest, tileset
 from ..codecs.rad import rad_header
 from ..codecs.rules import RuleViolation
-from ..codecs.streamed_sog import manifest
-from ..codecs.tiles_3d import tileset_rules
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
@@ -31,7 +30,7 @@ CODES: dict[str, tuple[str, str]] = {
     "container.left-out": (WARNING, "the file holds data that sparklod does not read"),
     **{
         code: (severity, meaning)
-        for rules in (rad_header, manifest, tileset_rules)
+        for rules in (rad_header, streamed_manifest, tileset)
         for severity, meanings in ((ERROR, rules.ERRORS), (WARNING, rules.WARNINGS))
         for code, meaning in meanings.items()
     },

@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..codecs import tileset as tilesets
 from ..codecs.merging import Chunk
 from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16
 from ..codecs.rad.rad_header import RadChunkHeader, RadHeader, encoding_fields
@@ -17,12 +18,11 @@ from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.rules import RuleViolation
 from ..codecs.spark_codings import log_scale_table
-from ..codecs.streamed_sog.codec import RegionLayout, layout_of
-from ..codecs.streamed_sog.manifest import VERSION as STREAMED_SOG_VERSION
-from ..codecs.streamed_sog.manifest import scan_files, scan_splats
-from ..codecs.tiles_3d import tileset_rules
-from ..codecs.tiles_3d.codec import tile_files
-from ..codecs.tiles_3d.tileset import MAX_TILESET, Tileset, read_whole
+from ..codecs.streamed_manifest import VERSION as STREAMED_SOG_VERSION
+from ..codecs.streamed_manifest import scan_files, scan_splats
+from ..codecs.streamed_sog import RegionLayout, layout_of
+from ..codecs.tiles_3d import tile_files
+from ..codecs.tileset import MAX_TILESET, Tileset, read_whole
 from ..model.georeference import EarthPlace, place_of
 from ..model.scene import common_axis
 from ..system.progress import Progress, silent
@@ -350,20 +350,20 @@ def survey_tiles(
 ) -> HeaderScan:
     """Read a tileset and the headers of its tiles, and to `check` them their splats."""
     tileset = read_whole(file.read(MAX_TILESET + 1), open_companion)
-    found = list(tileset_rules.read_violations(tileset))
+    found = list(tilesets.read_violations(tileset))
     if not found:
-        found += tileset_rules.violations(tileset)
+        found += tilesets.violations(tileset)
     if any(each.fatal for each in found):
         return HeaderScan("tiles", found)
-    matrices = tileset_rules.matrices_of(tileset)
+    matrices = tilesets.matrices_of(tileset)
     named = {name: matrices[at] for at, tile in enumerate(tileset.tiles) if (name := tile.name) is not None}
     files = tile_files(open_companion, named)
-    chunks, about_files = tileset_rules.scan_files(tileset, files)
+    chunks, about_files = tilesets.scan_files(tileset, files)
     found += about_files
     if any(each.fatal for each in found):
         return HeaderScan("tiles", found)
     if check:
-        found += tileset_rules.scan_splats(tileset, files, chunks, threads=threads, progress=progress)
+        found += tilesets.scan_splats(tileset, files, chunks, threads=threads, progress=progress)
     # What a reader of the tiles without children finds.
     read = [chunk for number, chunk in chunks.items() if not tileset.tiles[number].children]
     head = Head(
@@ -381,7 +381,7 @@ def survey_tiles(
 def _tile_facts(tileset: Tileset, chunks: Mapping[int, Chunk]) -> TileFacts:
     asset = tileset.head["asset"]
     extras = asset.get("extras")
-    depths = tileset_rules.depths_of(tileset)
+    depths = tilesets.depths_of(tileset)
     sizes = [chunk.bytes for chunk in chunks.values()]
     by_depth = [[at for at in range(len(depths)) if depths[at] == depth] for depth in range(max(depths) + 1)]
     total, error = tileset.bytes + sum(sizes), tileset.head.get("geometricError")
@@ -418,7 +418,7 @@ def _tile_level(tileset: Tileset, chunks: Mapping[int, Chunk], numbers: Sequence
 
 def _place(tileset: Tileset) -> EarthPlace | None:
     """Return where the transform of the root puts the origin of the scene; None where that is not on the Earth."""
-    matrix = tileset_rules.matrix_of(tileset.tiles[0].record)
+    matrix = tilesets.matrix_of(tileset.tiles[0].record)
     if float(np.linalg.norm(matrix[:3, 3])) < ON_EARTH:
         return None
     found = place_of(tuple(matrix.T.ravel().tolist()))

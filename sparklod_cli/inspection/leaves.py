@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs import quantize
-from ..codecs.rad.codec import rounded
 from ..codecs.rad.property_codings import CODINGS, PROPERTIES, Row
+from ..codecs.rad.rad_writer import rounded
 from ..codecs.spark_codings import STEPS_8_8_8, encode_axis_angle, encode_lod_alpha
 from ..codecs.spz import LOD, Layout, to_code
 from ..codecs.statistics import Distribution, enough, fine_bits, sh_code_counts

@@ -18,8 +18,9 @@ from ..codecs.reader import code_of
 from ..codecs.spark_codings import SplatEncoding
 from ..codecs.spz import KNOWN_FLAGS
 from ..io.local_files import size_of_input
+from ..io.opening import opened, read_arrays
 from ..io.rad_file import fits
-from ..io.reading import opened, read_arrays, read_scene
+from ..io.reading import read_scene
 from ..model.scene import Scene
 from ..model.sh import width_of
 from ..model.splats import COLUMNS, Splats

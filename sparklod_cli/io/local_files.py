@@ -110,12 +110,12 @@ def _named_in(path: Path) -> list[Path]:
         form = sniff(head, path.suffix)
         if form is not None and not form.companions:
             return []
-        from ..codecs.glb.glb_container import GltfFile
+        from ..codecs.gltf_container import GltfFile
         from ..codecs.rad import rad_header
         from ..codecs.reader import OpenFile  # what most jobs do without, as what follows
-        from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
-        from ..codecs.tiles_3d.codec import names_of
-        from ..codecs.tiles_3d.tileset import MAX_TILESET
+        from ..codecs.streamed_manifest import MAX_MANIFEST, parse
+        from ..codecs.tiles_3d import names_of
+        from ..codecs.tileset import MAX_TILESET
 
         if head.startswith(rad_header.MAGIC):
             return _companion_paths(path, rad_header.read_header(file).filenames)

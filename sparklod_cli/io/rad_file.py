@@ -9,15 +9,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from ..codecs.rad.codec import RadChunk, read_chunk
 from ..codecs.rad.rad_header import RadHeader, header_violations, read_header
 from ..codecs.rad.rad_reader import RadReader, decoded_bytes, file_of
+from ..codecs.rad.rad_writer import RadChunk, read_chunk
 from ..codecs.rules import check_rules
 from ..model.splats import FloatArray
 from ..system.errors import UnreadableError
 from ..system.machine import available_memory
 from .local_files import open_named
-from .reading import opened, readable
+from .opening import opened, readable
 
 #: Files whose decoded columns take more bytes than this, or than this share of the free memory, are read chunk by
 #: chunk: computed values take as much again, and chunk by chunk is no slower
@@ -48,7 +48,7 @@ def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None
     """Read the header of a RAD file, and one chunk of it.
 
     Args:
-        palette: that of the first chunk, see `codecs.rad.codec.read_chunk`.
+        palette: that of the first chunk, see `codecs.rad.rad_writer.read_chunk`.
 
     Raises:
         FormatError: the header or the chunk cannot be read, or is broken.

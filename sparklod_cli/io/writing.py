@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 def _named_by_manifest(target: Place) -> Iterator[str]:
     from ..codecs.sog.sog_container import MAX_META, companion_names
-    from ..codecs.streamed_sog.manifest import MAX_MANIFEST, parse
+    from ..codecs.streamed_manifest import MAX_MANIFEST, parse
 
     for meta in parse(_content(target, MAX_MANIFEST)).names():
         folder = target.parent / meta.partition("/")[0]
@@ -45,7 +45,7 @@ def _named_by_manifest(target: Place) -> Iterator[str]:
 
 
 def _named_by_tileset(target: Place) -> Iterator[str]:
-    from ..codecs.tiles_3d import tileset
+    from ..codecs import tileset
 
     for name in tileset.parse(_content(target, tileset.MAX_TILESET)).names():
         yield name

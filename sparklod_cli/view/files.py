@@ -14,16 +14,16 @@ from pathlib import Path
 from urllib.parse import quote
 
 from ..codecs.formats import META, ZIP, head_of, sniff
-from ..codecs.glb.codec import open_content as open_glb
-from ..codecs.glb.glb_container import MAGIC as GLB_MAGIC
+from ..codecs.gltf import open_content as open_glb
+from ..codecs.gltf_container import MAGIC as GLB_MAGIC
 from ..codecs.rad.rad_header import CHUNK_MAGIC, MAGIC, RadHeader, read_header
 from ..codecs.reader import OpenFile
-from ..codecs.streamed_sog.manifest import MAX_MANIFEST, files_of_chunk, parse
-from ..codecs.tiles_3d.codec import names_of
-from ..codecs.tiles_3d.tileset import MAX_TILESET
+from ..codecs.streamed_manifest import MAX_MANIFEST, files_of_chunk, parse
+from ..codecs.tiles_3d import names_of
+from ..codecs.tileset import MAX_TILESET
 from ..codecs.zip_folder import ZipFolder
 from ..io.local_files import check_companion, in_folder, open_named, open_plain, reason_unreadable
-from ..io.reading import unknown_format
+from ..io.opening import unknown_format
 from ..model.lod_tree import CHUNK_NODES
 from ..system.errors import FormatError, NotSplatsError, UnreadableError, naming
 from ..system.untrusted import printable, quoted_value

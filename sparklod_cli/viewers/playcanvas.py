@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..codecs.reader import OpenCompanion, size_of
-from ..codecs.streamed_sog.codec import layout_of
-from ..codecs.streamed_sog.manifest import MAX_MANIFEST, files_of_chunk, parse
-from ..io.reading import opened
+from ..codecs.streamed_manifest import MAX_MANIFEST, files_of_chunk, parse
+from ..codecs.streamed_sog import layout_of
+from ..io.opening import opened
 from ..model.traversed import DetailScene
 from ..system.errors import FormatError
 from .cut import Forest, TreeCut, TreeInstance

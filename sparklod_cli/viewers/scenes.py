@@ -19,7 +19,7 @@ from ..cameras.framing import Balls, balls_of
 from ..codecs.formats import PRECISIONS, RAD
 from ..codecs.reader import Reader
 from ..io.local_files import size_of_input
-from ..io.reading import opened
+from ..io.opening import opened
 from ..lod.budget import Budget
 from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix

@@ -11,8 +11,8 @@ import pytest
 
 from sparklod_cli.codecs import clamps, encoder, sh_palette, spz
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad import rad_options
+from sparklod_cli.codecs.rad import rad_writer as rad
+from sparklod_cli.codecs.rad import rad_writer as rad_options
 from sparklod_cli.codecs.sh_palette import cluster
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.scene import Scene

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb
-from sparklod_cli.codecs.glb import codec as glb
-from sparklod_cli.codecs.glb.glb_container import TURNS
+from sparklod_cli.codecs import gltf as glb
+from sparklod_cli.codecs.gltf_container import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.io.reading import read_scene

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb
-from sparklod_cli.codecs.glb import codec as glb
-from sparklod_cli.codecs.glb import glb_container
-from sparklod_cli.codecs.glb.attributes import READ_AS_LOGS
+from sparklod_cli.codecs import gltf as glb
+from sparklod_cli.codecs import gltf_container
+from sparklod_cli.codecs.gltf_attributes import READ_AS_LOGS
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.reader import OpenFile, decode_file
 from sparklod_cli.inspection.report import ReportSettings, inspect
@@ -212,12 +212,12 @@ def test_buffers_that_cannot_be_read_are_refused(data: bytes, error: type[Except
 
 
 def test_data_within_the_json_may_be_large_and_the_rest_of_it_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(glb_container, "MAX_JSON", 8_000)
+    monkeypatch.setattr(gltf_container, "MAX_JSON", 8_000)
     assert len(gltf()) > 8_000
     assert_same(read(b"\xef\xbb\xbf" + gltf()).splats, SH2)
     with pytest.raises(UnsupportedError, match="larger than the 8,000 that are read"):
         read(gltf(name="x" * 8_000))
-    monkeypatch.setattr(glb_container, "MAX_TEXT", 9_000)
+    monkeypatch.setattr(gltf_container, "MAX_TEXT", 9_000)
     with pytest.raises(UnsupportedError, match="write it as GLB"):
         read(gltf())
 

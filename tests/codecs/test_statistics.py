@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.codecs import quantize, spz, statistics
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.statistics import (
     ALL,

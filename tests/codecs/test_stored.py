@@ -12,7 +12,7 @@ import pytest
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.encoder import results
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.reader import OpenFile, decode_file
 from sparklod_cli.codecs.spz import like
 from sparklod_cli.lod import quick

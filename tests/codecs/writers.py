@@ -22,8 +22,8 @@ from fixtures import (
     by_hand_streamed_sog,
     by_hand_tiles,
 )
+from sparklod_cli.codecs import gltf as glb
 from sparklod_cli.codecs import ply, quantize, sh_palette, splat, spz
-from sparklod_cli.codecs.glb import codec as glb
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.sog import codec as sog
 from sparklod_cli.codecs.sog import texel_codings as codings

@@ -11,7 +11,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.inspection.report import ReportSettings, inspect
-from sparklod_cli.io.reading import read_arrays
+from sparklod_cli.io.opening import read_arrays
 from tests.conftest import FIXTURES, Capture
 from tests.inspection.test_schema import VALIDATOR
 

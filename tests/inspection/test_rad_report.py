@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.rad import codec as codec
 from sparklod_cli.codecs.rad import rad_reader
+from sparklod_cli.codecs.rad import rad_writer as codec
 from sparklod_cli.inspection import headers, leaves
 from sparklod_cli.inspection.headers import PropertyFacts
 from sparklod_cli.inspection.html import FileSection, page

@@ -16,9 +16,9 @@ import pytest
 import sparklod_cli
 from fixtures.by_hand_sog import sog_files
 from fixtures.by_hand_streamed_sog import joined
+from sparklod_cli.codecs import streamed_sog as codec
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.codecs.streamed_sog import codec
-from sparklod_cli.codecs.streamed_sog.manifest import ERRORS, WARNINGS
+from sparklod_cli.codecs.streamed_manifest import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io.reading import read_parts
 from sparklod_cli.io.writing import parts_output

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.streamed_sog.manifest import MAX_MANIFEST
+from sparklod_cli.codecs.streamed_manifest import MAX_MANIFEST
 from sparklod_cli.inspection import html
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io.reading import read_parts, read_scene

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb, by_hand_tiles
-from sparklod_cli.codecs.glb.glb_container import TURNS
+from sparklod_cli.codecs import tiles_3d as codec
+from sparklod_cli.codecs import tileset as tilesets
+from sparklod_cli.codecs.gltf_container import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
-from sparklod_cli.codecs.tiles_3d import codec, tileset_rules
-from sparklod_cli.codecs.tiles_3d.tileset_rules import ERRORS, WARNINGS
+from sparklod_cli.codecs.tileset import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import quality
@@ -188,7 +189,7 @@ def test_every_code_of_the_rules_has_a_fault() -> None:
 
 
 def test_large_tiles_are_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tileset_rules, "LARGE", 29)
+    monkeypatch.setattr(tilesets, "LARGE", 29)
     assert codes(write(SOUND, tmp_path)) == ["large"]
 
 

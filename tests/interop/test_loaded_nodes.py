@@ -12,8 +12,8 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad.rad_options import HALF
+from sparklod_cli.codecs.rad import rad_writer as rad
+from sparklod_cli.codecs.rad.rad_writer import HALF
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick

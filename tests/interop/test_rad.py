@@ -19,7 +19,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs import quantize
 from sparklod_cli.codecs.gpu import packed_splats
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_chunk_header, read_header
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spark_codings import SplatEncoding, encode_lod_alpha

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.io.reading import read_scene

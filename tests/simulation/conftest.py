@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.foveation import Frustum
 from sparklod_cli.model.instances import Instance

@@ -16,8 +16,8 @@ from fixtures import by_hand_rad
 from sparklod_cli import __version__
 from sparklod_cli.codecs.clamps import clamps_in
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
-from sparklod_cli.codecs.rad import rad_options
+from sparklod_cli.codecs.rad import rad_writer as rad
+from sparklod_cli.codecs.rad import rad_writer as rad_options
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spark_codings import SplatEncoding

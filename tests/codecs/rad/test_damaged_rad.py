@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_rad
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.property_codings import CODINGS
 from sparklod_cli.codecs.rad.rad_header import read_header
 from sparklod_cli.codecs.reader import decode_file

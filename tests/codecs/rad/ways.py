@@ -13,10 +13,10 @@ from fixtures import (
 )
 from sparklod_cli.codecs import spark_codings
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.property_codings import LARGEST_F16
 from sparklod_cli.codecs.rad.rad_header import ENCODING_KEYS
-from sparklod_cli.codecs.rad.rad_options import HALF
+from sparklod_cli.codecs.rad.rad_writer import HALF
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.model.scene import Scene
 from tests.codecs.cases import Array, Case, Content, Precision, linear, stated_degrees

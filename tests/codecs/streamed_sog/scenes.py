@@ -8,8 +8,8 @@ from typing import BinaryIO
 
 import numpy as np
 
+from sparklod_cli.codecs import streamed_sog as codec
 from sparklod_cli.codecs.options import DEFAULTS
-from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.system.errors import FormatError

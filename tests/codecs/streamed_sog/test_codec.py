@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_sog, by_hand_streamed_sog
+from sparklod_cli.codecs import streamed_sog as codec
 from sparklod_cli.codecs.merging import SceneFiles
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.streamed_sog import codec
+from sparklod_cli.codecs import streamed_sog as codec
 from sparklod_cli.system.errors import FormatError
 from tests.codecs.damage import VALUES, attempt, content, files_of, places_of, replaced
 

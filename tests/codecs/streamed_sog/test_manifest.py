@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sparklod_cli.codecs import streamed_manifest as manifests
 from sparklod_cli.codecs.formats import is_of_streamed_sog
-from sparklod_cli.codecs.streamed_sog import manifest as manifests
-from sparklod_cli.codecs.streamed_sog.manifest import LARGEST, Manifest, ManifestNode, Run, parse, serialise
+from sparklod_cli.codecs.streamed_manifest import LARGEST, Manifest, ManifestNode, Run, parse, serialise
 from sparklod_cli.system.errors import FormatError, VersionError
 
 BOUND = {"min": [-1, 0, 0.5], "max": [1, 2, 3e5]}

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sparklod_cli.codecs import streamed_sog as codec
 from sparklod_cli.codecs.formats import sniff
 from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.sog import codec as sog
-from sparklod_cli.codecs.streamed_sog import codec
-from sparklod_cli.codecs.streamed_sog.manifest import parse
+from sparklod_cli.codecs.streamed_manifest import parse
 from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.model import morton

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb, by_hand_tiles
+from sparklod_cli.codecs import tiles_3d as codec
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
-from sparklod_cli.codecs.tiles_3d import codec
-from sparklod_cli.codecs.tiles_3d.tileset import LARGEST
+from sparklod_cli.codecs.tileset import LARGEST
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.part_settings import TileSettings

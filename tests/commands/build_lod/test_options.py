@@ -146,7 +146,7 @@ print(*sorted(sys.modules))
 """
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "sparklod_cli.codecs.ply" in loaded
-    others = ("cameras.camera", "codecs.sog.sog_container", "codecs.streamed_sog.manifest", "codecs.rad.codec")
+    others = ("cameras.camera", "codecs.sog.sog_container", "codecs.streamed_manifest", "codecs.rad.rad_writer")
     others += (
         "codecs.gpu.dump",
         "bake.out_of_core.cluster",

@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.rad_header import read_chunk_header, read_header
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick

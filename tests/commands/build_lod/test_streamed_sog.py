@@ -196,7 +196,7 @@ def test_a_smaller_output_removes_the_files_of_a_larger_one(town: Path, tmp_path
 def test_an_interruption_leaves_what_was_there(
     before: bool, town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sparklod_cli.codecs.streamed_sog import codec
+    from sparklod_cli.codecs import streamed_sog as codec
 
     web = tmp_path / "web"
     if before:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.rad import codec as rad
+from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.simulation.results import LOADING
 from tests.commands.traverse.runs import ORBIT, OTHER, TOWN, TREE, scene_file, table, traverse

@@ -16,8 +16,8 @@ import pytest
 import sparklod_cli
 from fixtures import demo_scene
 from sparklod_cli.cameras.camera import Camera
+from sparklod_cli.codecs import streamed_sog as codec
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.codecs.streamed_sog import codec
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import parts, quality

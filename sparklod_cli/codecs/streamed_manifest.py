@@ -19,20 +19,20 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ...model.morton import order_of_cells
-from ...model.splats import FloatArray, Splats
-from ...system.errors import FormatError, VersionError
-from ...system.progress import Progress, silent
-from ...system.units import count_of
-from ...system.untrusted import Json, quoted_value
-from .. import quantize
-from ..formats import MANIFEST, ZIP
-from ..merging import Chunk, SceneFiles, not_finite
-from ..reader import FileNote, OpenCompanion, code_of, read_note
-from ..rules import RuleViolation, count_outside, leads_away, nodes_of, parse_manifest, place_of, violation
-from ..sog import codec as sog
-from ..sog import texel_codings
-from ..sog.sog_container import MAX_META, image_names, parse_meta
+from ..model.morton import order_of_cells
+from ..model.splats import FloatArray, Splats
+from ..system.errors import FormatError, VersionError
+from ..system.progress import Progress, silent
+from ..system.units import count_of
+from ..system.untrusted import Json, quoted_value
+from . import quantize
+from .formats import MANIFEST, ZIP
+from .merging import Chunk, SceneFiles, not_finite
+from .reader import FileNote, OpenCompanion, code_of, read_note
+from .rules import RuleViolation, count_outside, leads_away, nodes_of, parse_manifest, place_of, violation
+from .sog import codec as sog
+from .sog import texel_codings
+from .sog.sog_container import MAX_META, image_names, parse_meta
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1

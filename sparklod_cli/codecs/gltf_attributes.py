@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ...model import MAX_SH_DEGREE
-from ...model.gaussian import normalized_quat
-from ...model.sh import COEFFICIENTS, notes_on_degree
-from ...model.splats import FloatArray, Splats
-from ...system.errors import FormatError
-from .. import quantize
-from ..reader import left_out
+from ..model import MAX_SH_DEGREE
+from ..model.gaussian import normalized_quat
+from ..model.sh import COEFFICIENTS, notes_on_degree
+from ..model.splats import FloatArray, Splats
+from ..system.errors import FormatError
+from . import quantize
+from .reader import left_out
 
 EXTENSION, COMPRESSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
 

@@ -12,25 +12,25 @@ from typing import BinaryIO, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model import morton
-from ...model.scene import Scene, facts_of
-from ...model.sh import width_of
-from ...model.splats import Splats
-from ...model.traversed import Bounds, Counts, DetailScene
-from ...system.errors import FormatError
-from ...system.progress import Progress, silent
-from ...system.threads import ordered_map
-from ...system.units import count_of
-from ...system.untrusted import quoted_value
-from .. import quantize
-from ..compression import check_promise
-from ..formats import ENVIRONMENT_FILE, MANIFEST, META, chunk_folder
-from ..merging import Chunk
-from ..options import WriteOptions
-from ..reader import OpenCompanion, OpenFile, Reader, note_of, size_of
-from ..rules import check_rules, error_of
-from ..sog import codec as sog
-from .manifest import (
+from ..model import morton
+from ..model.scene import Scene, facts_of
+from ..model.sh import width_of
+from ..model.splats import Splats
+from ..model.traversed import Bounds, Counts, DetailScene
+from ..system.errors import FormatError
+from ..system.progress import Progress, silent
+from ..system.threads import ordered_map
+from ..system.units import count_of
+from ..system.untrusted import quoted_value
+from . import quantize
+from .compression import check_promise
+from .formats import ENVIRONMENT_FILE, MANIFEST, META, chunk_folder
+from .merging import Chunk
+from .options import WriteOptions
+from .reader import OpenCompanion, OpenFile, Reader, note_of, size_of
+from .rules import check_rules, error_of
+from .sog import codec as sog
+from .streamed_manifest import (
     MAX_MANIFEST,
     VERSION,
     Bound,

@@ -17,22 +17,19 @@ from typing import Any, cast
 
 import numpy as np
 
-from ...model.scene import Scene
-from ...model.sh import width_of
-from ...model.splats import FloatArray, Splats
-from ...model.transforms import Transform
-from ...system.errors import FormatError, NotSplatsError, UnsupportedError
-from ...system.progress import Progress, silent
-from ...system.threads import blocks_of, ordered_map
-from ...system.units import count_of
-from ...system.untrusted import quoted_value
-from .. import spz
-from ..compression import check_promise
-from ..encoder import SPZ_RANGES, CodeRange
-from ..merging import copy_rows
-from ..options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
-from ..reader import FileNote, OpenFile, Reader, Target, encode_rows, left_out, note_of, read_note
-from .attributes import (
+from ..model.scene import Scene
+from ..model.sh import width_of
+from ..model.splats import FloatArray, Splats
+from ..model.transforms import Transform
+from ..system.errors import FormatError, NotSplatsError, UnsupportedError
+from ..system.progress import Progress, silent
+from ..system.threads import blocks_of, ordered_map
+from ..system.units import count_of
+from ..system.untrusted import quoted_value
+from . import spz
+from .compression import check_promise
+from .encoder import SPZ_RANGES, CodeRange
+from .gltf_attributes import (
     ATTRIBUTES,
     COMPRESSION,
     EXTENSION,
@@ -49,7 +46,7 @@ from .attributes import (
     notes_on,
     sh_attributes,
 )
-from .glb_container import (
+from .gltf_container import (
     FLOAT,
     TURNS,
     TYPES,
@@ -62,6 +59,9 @@ from .glb_container import (
     rotation_of_up,
     transform_of,
 )
+from .merging import copy_rows
+from .options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
+from .reader import FileNote, OpenFile, Reader, Target, encode_rows, left_out, note_of, read_note
 
 #: Extensions that a file may require, and how those begin that change no splats: materials and lights are ignored.
 READ = (EXTENSION, COMPRESSION, OLD_COMPRESSION, "KHR_mesh_quantization")

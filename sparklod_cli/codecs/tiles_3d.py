@@ -17,21 +17,21 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.scene import Scene, common_axis, facts_of
-from ...model.sh import width_of
-from ...model.traversed import TileScene
-from ...system.errors import FormatError
-from ...system.progress import Progress, silent
-from ...system.threads import ordered_map
-from ...system.untrusted import quoted_value
-from ..compression import check_promise
-from ..formats import TILES, TILESET
-from ..glb import codec as glb
-from ..glb.glb_container import transform_of
-from ..merging import Chunk, SceneFiles
-from ..options import CESIUM, WriteOptions
-from ..reader import Note, OpenCompanion, OpenFile, Reader, note_of
-from ..rules import check_rules, error_of
+from ..model.scene import Scene, common_axis, facts_of
+from ..model.sh import width_of
+from ..model.traversed import TileScene
+from ..system.errors import FormatError
+from ..system.progress import Progress, silent
+from ..system.threads import ordered_map
+from ..system.untrusted import quoted_value
+from . import gltf
+from .compression import check_promise
+from .formats import TILES, TILESET
+from .gltf_container import transform_of
+from .merging import Chunk, SceneFiles
+from .options import CESIUM, WriteOptions
+from .reader import Note, OpenCompanion, OpenFile, Reader, note_of
+from .rules import check_rules, error_of
 from .tileset import (
     CONTENT_GLTF,
     LARGEST,
@@ -40,11 +40,15 @@ from .tileset import (
     VERSION,
     Tileset,
     Volume,
+    matrices_of,
+    matrix_of,
+    read_violations,
     read_whole,
     to_tileset,
     turned,
+    violations,
+    volumes_of,
 )
-from .tileset_rules import matrices_of, matrix_of, read_violations, violations, volumes_of
 
 #: Note of scenes whose splats have the coordinates of their tileset.
 NOT_PLACED = Note("the transform of the tileset, its place on the Earth, is not applied")
@@ -114,7 +118,7 @@ def names_of(data: bytes, open_companion: OpenCompanion) -> list[str]:
             return open_companion(opened[-1])
 
         with open_companion(name) as file:
-            glb.open_content(OpenFile(file, open_buffer))
+            gltf.open_content(OpenFile(file, open_buffer))
         names |= dict.fromkeys(opened)
     return list(names)
 
@@ -180,13 +184,13 @@ def tile_files(open_companion: OpenCompanion | None, matrices: dict[str, Matrix]
     """Return the glTF files of tiles, whose (4, 4) transforms are applied when they are read."""
 
     def open_tile(name: str, source: OpenFile) -> Reader:
-        content = glb.open_content(source)
+        content = gltf.open_content(source)
         matrix = matrices.get(name)
         if matrix is None or np.array_equal(matrix, np.eye(4)):
             return content
         turn = np.eye(4)
         turn[:3, :3] = to_tileset(content.up)
-        return glb.placed(content, transform_of(turn.T @ matrix @ turn))
+        return gltf.placed(content, transform_of(turn.T @ matrix @ turn))
 
     return SceneFiles(open_companion, TILESET, "tiles.files", open_tile)
 
@@ -226,7 +230,7 @@ def encode_files(
 
     def encoded(tile: int) -> bytes:
         one = Scene(scene.splats.take(scene.run(tile)), antialiased=scene.antialiased, up=scene.up)
-        return b"".join(glb.encode(one, options, threads=max(1, threads // together)))
+        return b"".join(gltf.encode(one, options, threads=max(1, threads // together)))
 
     for tile, data in enumerate(ordered_map(encoded, range(scene.tiles), together)):
         yield f"{TILES}/{names[tile]}.glb", [data]
@@ -286,7 +290,7 @@ def box_of(corners: Any) -> list[float]:
 
 def _tileset(scene: TileScene, options: WriteOptions, root: JsonObject, error: float) -> JsonObject:
     """Return a tileset; `error` is its geometric error where none of it is drawn."""
-    extensions = glb.extensions_of(options.glb_profile or CESIUM)
+    extensions = gltf.extensions_of(options.glb_profile or CESIUM)
     return {
         "asset": {"version": VERSION, "extras": note_of(antialiased=scene.antialiased, up=scene.up)},
         "geometricError": error,

@@ -1,1 +1,0 @@
-"""Binary glTF with the extension KHR_gaussian_splatting."""

@@ -1,1 +1,0 @@
-"""Streamed SOG, a folder of SOG chunks at several detail levels: `codec` reads and writes it."""
