@@ -13,15 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.conftest import FIXTURES, ROOT
+from tests.conftest import FIXTURES
 from tests.interop.pictures import psnr
 
-from .gallery import OF_A_BROWSER, SCENE, SERVERS, TUTORIALS, drawn, folder_of, pictures
+from .gallery import SCENE, SERVERS, TUTORIALS, drawn, folder_of
 from .shell import TIMEOUT, Shell
-from .test_pages import words
-
-#: Words of a tutorial, and bytes of one of its pictures.
-MAX_WORDS, MAX_BYTES = 1500, 60_000
 
 #: Relative tolerance of the numbers in outputs, for other versions of compressors.
 TOLERANCE = 0.02
@@ -30,8 +26,6 @@ TOLERANCE = 0.02
 LEAST = 30
 
 NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?")
-
-by_page = pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 
 
 def steps(page: Path) -> Iterator[tuple[str, str]]:
@@ -72,7 +66,7 @@ def check_server(shell: Shell, script: str) -> None:
         server.communicate()
 
 
-@by_page
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 @pytest.mark.slow
 def test_the_commands_print_and_draw_what_the_page_shows(page: Path, tmp_path: Path, shell: Shell) -> None:
     shutil.copy(FIXTURES / SCENE, tmp_path)
@@ -91,23 +85,6 @@ def test_the_commands_print_and_draw_what_the_page_shows(page: Path, tmp_path: P
             for folder in (tmp_path, folder_of(page))
         )
         assert psnr(ours - stored) >= LEAST, picture
-
-
-@by_page
-def test_a_tutorial_is_short_and_its_pictures_are_small(page: Path) -> None:
-    assert words(page) <= MAX_WORDS
-    shown = [Path(picture).name for picture in pictures(page)]
-    assert shown
-    assert {path.name for path in folder_of(page).iterdir()} == set(shown)
-    assert [path.name for path in folder_of(page).iterdir() if path.stat().st_size > MAX_BYTES] == []
-    text = page.read_text(encoding="utf-8")
-    assert all(f"-o {name}" in text for name in set(shown) - OF_A_BROWSER)
-
-
-def test_every_tutorial_is_linked_from_the_first_pages() -> None:
-    for name, folder in (("README.md", "docs/tutorials"), ("docs/index.md", "tutorials")):
-        text = (ROOT / name).read_text(encoding="utf-8")
-        assert [page.name for page in TUTORIALS if f"]({folder}/{page.name})" not in text] == []
 
 
 @pytest.mark.parametrize(
