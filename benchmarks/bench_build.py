@@ -19,7 +19,7 @@ from performance.rows import Row, Table, figure, label, ratio
 from scenes import load, tiled, write_ply
 
 import sparklod_cli as sparklod
-from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.tree_settings import METHODS
 
 HERE = Path(__file__).resolve().parent
 

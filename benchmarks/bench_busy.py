@@ -20,7 +20,7 @@ from pathlib import Path
 from performance.process import SPARKLOD, environment
 from performance.rows import Row, Table, figure, label, ratio
 
-from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.tree_settings import METHODS
 
 #: Options by the name of a row.
 WAYS: dict[str, list[str]] = {"all": [], "one": ["--threads", "1"]}

@@ -19,7 +19,7 @@ import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.lod import parts, quality
-from sparklod_cli.lod.part_settings import DetailSettings
+from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.scene import Scene
 from tests.interop.engines.browser import Browser, Shown
 from tests.interop.pictures import cameras_around

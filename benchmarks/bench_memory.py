@@ -16,7 +16,7 @@ from scenes import load, ply_header, ply_rows, tiled
 
 from sparklod_cli.bake import estimate
 from sparklod_cli.bake.settings import BakeSettings as Settings
-from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.model.sh import COEFFICIENTS
 
 #: Bakes, and prints the peak of resident memory in kB and that of the scratch folder in bytes.

@@ -19,10 +19,10 @@ import sparklod_cli
 from sparklod_cli.bake import parts_output
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod import quality
-from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.lod.parts import detail_cuts, make_levels, owners_of
+from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.gaussian import covariance
-from sparklod_cli.model.traversed import DetailScene
+from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.rasterizer import shade
 from sparklod_cli.render.settings import RasterSettings

@@ -24,7 +24,7 @@ from scale_scenes import bytes_of, write_tiled
 from scenes import load
 
 from sparklod_cli import Splats
-from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.system.units import parse_size
 
 HERE = Path(__file__).resolve().parent

@@ -19,8 +19,8 @@ from sparklod_cli.codecs.compression import MIXED
 from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.spz import WAYS
-from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.lod.chunk_order import arrange
+from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.progress import silent
 

@@ -24,9 +24,9 @@ import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import look_at
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.codecs.gpu import lod_tree
+from sparklod_cli.model.lod_tree import Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.model.tree_nodes import Nodes
 from sparklod_cli.simulation.frames import Changes, measure
 from sparklod_cli.system.threads import on_threads, ordered_map, processors
 from sparklod_cli.viewers.continuous import ContinuousCuts

@@ -43,7 +43,7 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .fitting.settings import FitSettings as FitSettings
     from .fitting.settings import Refined as Refined
     from .inspection.report import Report as Report
-    from .lod.part_settings import DetailSettings as DetailSettings
+    from .lod.tree_settings import DetailSettings as DetailSettings
     from .model.foveation import Cones as Cones
     from .model.foveation import Frustum as Frustum
     from .model.instances import Instance as Instance

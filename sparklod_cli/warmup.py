@@ -171,7 +171,7 @@ JOBS = {
     "quality": (
         "node_rows.fill_leaf_rows",
         "pair_merge.merge_pairs",
-        "pair_cost.find_partners",
+        "pair_merge.find_partners",
         "prune.link",
         "prune.size_ranks",
         "prune.lay_out_children",

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.node_stream import NodeStream
+from sparklod_cli.model.lod_tree import LodTree, NodeStream
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from fixtures import by_hand_sog, by_hand_streamed_sog
+from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.model.traversed import DetailScene
 
 
 def columns_of(splats: Splats) -> dict[str, np.ndarray]:

@@ -30,8 +30,8 @@ from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io.reading import read_scene
-from sparklod_cli.lod.builders import METHODS
 from sparklod_cli.lod.chunk_order import viewpoints
+from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection

@@ -13,9 +13,8 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.lod.budget import Budget, parse_budget
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.render.color_by import numbers_of, scale_of_splats
 from sparklod_cli.viewers.playcanvas import LoadedDetail
 from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes

@@ -10,7 +10,7 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.tiles_3d import encode_files
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import parts, quality
-from sparklod_cli.lod.part_settings import TileSettings
+from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.splats import Splats
 from tests.outputs import write_files
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from sparklod_cli.lod.builders import MAX_BASE, MAX_GROWTH, METHODS, MIN_BASE, MIN_GROWTH
+from sparklod_cli.lod.tree_settings import MAX_BASE, MAX_GROWTH, METHODS, MIN_BASE, MIN_GROWTH
 
 from .. import laws, scenes
 from ..case import Case, LawError, Rng

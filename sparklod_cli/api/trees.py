@@ -13,7 +13,7 @@ from ..cameras.sources import CameraPath
 from ..codecs.reader import check_valid
 from ..fitting import STEPS
 from ..fitting.settings import FitSettings, Refined
-from ..lod.builders import (
+from ..lod.tree_settings import (
     BUILDERS,
     DEFAULT_BASE,
     DEFAULT_GROWTH,

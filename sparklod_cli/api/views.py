@@ -20,8 +20,7 @@ from ..cameras.sources import orbit as orbit_cameras
 from ..codecs.formats import PRECISIONS
 from ..images import metrics
 from ..model.instances import Instance, names_of
-from ..model.scene import Scene
-from ..model.traversed import DetailScene
+from ..model.scene import DetailScene, Scene
 from ..render.rasterizer import Image
 from ..render.renderer import Renderer
 from ..render.settings import RenderSettings

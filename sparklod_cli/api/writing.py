@@ -12,7 +12,7 @@ from ..codecs.options import RadOptions, SogOptions, WriteOptions
 from ..codecs.reader import check_valid
 from ..codecs.spark_codings import SplatEncoding
 from ..io.writing import parts_output, scene_output, write_scene
-from ..lod.part_settings import DetailSettings
+from ..lod.tree_settings import DetailSettings
 from ..model.scene import Scene
 from ..system.errors import FormatError, InvalidSplatsError, memory_errors_translated, naming
 from ..system.output import Output

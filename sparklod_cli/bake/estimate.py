@@ -1,13 +1,13 @@
 """Memory and disk space that a bake takes: estimates.
 
-Coefficients are measured as those of `lod.builders.SplatBytes`.
+Coefficients are measured as those of `lod.tree_settings.SplatBytes`.
 """
 
 from __future__ import annotations
 
 import functools
 
-from ..lod.builders import BUILDERS, bytes_of
+from ..lod.tree_settings import BUILDERS, bytes_of
 from ..system import machine
 from ..system.errors import OutOfMemoryError
 from ..system.units import format_size

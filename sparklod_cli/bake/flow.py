@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from ..codecs.formats import META, RAD_SUFFIX
 from ..codecs.reader import Reader
 from ..io.reading import Source, open_reader
-from ..lod.builders import METHODS
+from ..lod.tree_settings import METHODS
 from ..model.scene import Scene, up_note
 from ..system.addresses import Place
 from ..system.errors import memory_errors_translated

@@ -12,7 +12,7 @@ from ..codecs.reader import check_valid, is_valid_and_visible
 from ..codecs.statistics import Statistics
 from ..io.local_files import read_rgba
 from ..io.reading import Source, read_scene
-from ..lod.builders import BUILDERS
+from ..lod.tree_settings import BUILDERS
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene, rotated_axis
 from ..model.selection import Selection, SelectionTally

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from ..cameras.camera import FARTHEST, rotation_of
 from ..codecs.formats import ENVIRONMENT, folders_of
 from ..codecs.options import WriteOptions
-from ..lod.part_settings import DetailSettings, TileSettings
+from ..lod.tree_settings import DetailSettings, TileSettings
 from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..model.gaussian import lod_opacity
-from ..model.scene import Scene
+from ..model.scene import DetailScene, Scene
 from ..model.sh import degree_of
 from ..model.splats import Splats
-from ..model.traversed import DetailScene
 from ..render.kernels.ellipse import Limits
 from ..render.kernels.project import TILE, ShadedColumns
 from ..render.kernels.region_errors import compare_levels

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 from ..codecs.options import WriteOptions
 from ..io.reading import Merged as Merged
 from ..io.reading import Source as Source
-from ..lod.builders import DEFAULT_BASE, DEFAULT_GROWTH, METHODS
+from ..lod.tree_settings import DEFAULT_BASE, DEFAULT_GROWTH, METHODS
 from ..model import MAX_SH_DEGREE
 from ..model.selection import Selection
 
 if TYPE_CHECKING:
     from ..codecs.clamps import Clamp
     from ..fitting.settings import FitSettings, Refined
-    from ..lod.part_settings import DetailSettings, TileSettings
+    from ..lod.tree_settings import DetailSettings, TileSettings
     from ..model.transforms import Transform
     from ..system.addresses import Place
     from .parts_output import WrittenDetail, WrittenTiles

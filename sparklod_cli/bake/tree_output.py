@@ -27,7 +27,7 @@ from .settings import Baked, BakeSettings
 if TYPE_CHECKING:
     from ..codecs.encoder import Encoder, Windows
     from ..codecs.statistics import Statistics
-    from ..model.node_stream import NodeStream
+    from ..model.lod_tree import NodeStream
 
 
 @dataclass(kw_only=True, eq=False)

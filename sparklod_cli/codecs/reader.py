@@ -30,7 +30,7 @@ from ..system.untrusted import parse_json, printable, quoted_value
 from .kernels.drawable import count_doubtful
 
 if TYPE_CHECKING:
-    from ..model.file_coding import FileCoding
+    from ..model.scene import FileCoding
 
 #: Least bytes of a block: with narrow rows, such as SPZ's streams, handing a smaller one to a thread costs more than it
 #: saves.

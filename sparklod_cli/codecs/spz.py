@@ -35,7 +35,7 @@ from .quantize import ALL_BITS, Bytes
 from .reader import FileNote, OpenFile, Read, Reader, Scratch, Target, comment_of, read_comment, rows_of
 
 if TYPE_CHECKING:
-    from ..model.node_stream import NodeStream
+    from ..model.lod_tree import NodeStream
     from .encoder import CodeRange, Encoded, Windows
     from .inflate import Inflate
     from .options import WriteOptions
@@ -203,7 +203,7 @@ def open_content(source: OpenFile) -> Reader:
             done += count
             progress("reading", done, layout.total, "B")
 
-    from ..model.file_coding import SPZ_SCALES, FileCoding  # writing does without
+    from ..model.scene import SPZ_SCALES, FileCoding  # writing does without
 
     notes = notes_on_degree(layout.sh_degree) + note.problems + notes
     if header.get("unknown_streams"):

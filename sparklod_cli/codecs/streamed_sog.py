@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import morton
-from ..model.scene import Scene, facts_of
+from ..model.scene import Bounds, Counts, DetailScene, Scene, facts_of
 from ..model.sh import width_of
 from ..model.splats import Splats
-from ..model.traversed import Bounds, Counts, DetailScene
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
@@ -165,7 +164,7 @@ TOGETHER = 2
 
 
 class Divided(Protocol):
-    """Division of a scene into regions, for the manifest; `lod.part_settings.DetailSettings` is one."""
+    """Division of a scene into regions, for the manifest; `lod.tree_settings.DetailSettings` is one."""
 
     @property
     def chunk_splats(self) -> int:

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..model.scene import Bounds
 from ..model.splats import Splats
-from ..model.traversed import Bounds
 from ..system.errors import FormatError, UnsupportedError, VersionError
 from ..system.progress import Progress, silent
 from ..system.units import count_of

@@ -14,7 +14,7 @@ from ..codecs.options import WriteOptions
 from ..fitting import STEPS
 from ..fitting.settings import FitSettings
 from ..lod.budget import Budget, doubt, parse_budget
-from ..lod.builders import DETAIL_GROWTH
+from ..lod.tree_settings import DETAIL_GROWTH
 from ..system import interrupts
 from ..system.addresses import Place
 from ..system.errors import FormatError, SparklodError, naming

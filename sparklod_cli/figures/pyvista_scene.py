@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from ..images.pixels import FAINT, INK, LINE, font, write_scale, write_title
-from ..lod.builders import DEFAULT_BASE
+from ..lod.tree_settings import DEFAULT_BASE
 from ..model.gaussian import rotation_matrix
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import Coloring, ticks

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ..images.output import PLOT_BY
 from ..images.pixels import BACKGROUND
-from ..lod.builders import DEFAULT_BASE
 from ..lod.kernels.tree_links import find_depths
+from ..lod.tree_settings import DEFAULT_BASE
 from ..model.gaussian import lod_opacity, spark_size
 from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import ASSUMED, AXES, Scene

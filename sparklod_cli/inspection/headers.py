@@ -23,8 +23,8 @@ from ..codecs.streamed_manifest import scan_files, scan_splats
 from ..codecs.streamed_sog import RegionLayout, layout_of
 from ..codecs.tiles_3d import tile_files
 from ..codecs.tileset import MAX_TILESET, Tileset, read_whole
-from ..model.georeference import EarthPlace, place_of
 from ..model.scene import common_axis
+from ..model.transforms import EarthPlace, place_of
 from ..system.progress import Progress, silent
 from ..system.untrusted import LARGEST, MOST, printable
 from .findings import Finding, findings_of

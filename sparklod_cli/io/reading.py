@@ -27,8 +27,8 @@ from .opening import open_splats, opened, readable
 
 if TYPE_CHECKING:
     from ..codecs.options import WriteOptions
+    from ..model.scene import DetailScene, TileScene
     from ..model.transforms import Transform
-    from ..model.traversed import DetailScene, TileScene
 
 #: Files of one scene that stay open, and files that are opened again and stay open: each has a palette of up to 12 MB.
 #: Chosen.

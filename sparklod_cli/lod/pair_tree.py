@@ -17,12 +17,11 @@ from ..model.sh import degree_of
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..system.progress import Progress
 from ..system.threads import blocks_of, for_blocks, threads_for, threads_in_use
-from .check import Bounds
-from .kernels import node_rows, pair_cost, pair_merge, prune
+from .kernels import node_rows, pair_merge, prune
 from .kernels.geometry import SplatColumns
 from .kernels.node_rows import fill_leaves, merge_colors
 from .kernels.sort import Keys, Nodes, sort_by_key
-from .stage_records import Region
+from .stages import Bounds, Region
 
 #: Sample size for the scene's middle, unit and box. Chosen.
 SAMPLE = 1 << 14
@@ -120,7 +119,7 @@ class Curve:
 
     def leaf_rows(self, splats: Splats, index: Nodes) -> tuple[FloatArray, FloatArray]:
         """Return the (n, WIDTH) node rows and (n,) feature sizes, in units, of some splats."""
-        rows, size = np.empty((len(index), pair_cost.WIDTH), np.float32), np.empty(len(index), np.float32)
+        rows, size = np.empty((len(index), pair_merge.WIDTH), np.float32), np.empty(len(index), np.float32)
         columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
         node_rows.fill_leaf_rows(len(index), index, columns, splats.rgb, self.space, rows, size)
         return rows, size
@@ -150,7 +149,7 @@ class BinaryTree:
     has one row to spare, the next merge takes that of its first node, and N rows are enough for all 2N - 1 nodes.
 
     Attributes:
-        rows: (N, WIDTH) float32 node rows, see `kernels/pair_cost.py`; leaf k has row k until it is merged. The array
+        rows: (N, WIDTH) float32 node rows, see `kernels/pair_merge.py`; leaf k has row k until it is merged. The array
             owns its memory, and no other refers to it.
         weight: (N,) float32 weights of the leaves, which outlast their rows.
         row: (N,) uint32 row of each merged node.
@@ -180,7 +179,7 @@ class BinaryTree:
         sizes[:count] = size
         row, spare = np.empty(count, np.uint32), np.empty(count, np.uint32)
         children, error = np.empty((count, 2), np.uint32), np.empty(count, np.float32)
-        return cls(rows, rows[:, pair_cost.WEIGHT].copy(), row, spare, children, sizes, error, count)
+        return cls(rows, rows[:, pair_merge.WEIGHT].copy(), row, spare, children, sizes, error, count)
 
     @property
     def leaves(self) -> int:
@@ -207,7 +206,7 @@ class BinaryTree:
             kept = self.rows[part][is_kept[part]]
             self.rows[end : end + len(kept)] = kept
             end += len(kept)
-        self.rows.resize((end, pair_cost.WIDTH), refcheck=False)
+        self.rows.resize((end, pair_merge.WIDTH), refcheck=False)
 
 
 def levels_of(size: FloatArray) -> Levels:
@@ -252,7 +251,7 @@ def merge_levels(
         # A node's size is about 2 * sqrt(trace of its covariance / 3).
         size = BASE ** (lowest + level + 1)
         if region is not None:
-            center, margin = binary.rows[binary.rows_of(active), : pair_cost.COVARIANCE], MARGIN * size
+            center, margin = binary.rows[binary.rows_of(active), : pair_merge.COVARIANCE], MARGIN * size
             near = np.any((center < low + margin) | (center > high - margin), axis=1)
             waiting.append((active[near], np.full(np.count_nonzero(near), lowest + level, np.int32)))
             active = active[~near]
@@ -300,9 +299,9 @@ def _merge(
 
 
 def partners(rows: FloatArray, nodes: Nodes, window: int, largest: np.float32) -> tuple[NDArray[np.int32], FloatArray]:
-    """Return (n,) places of the cheapest partners of nodes, -1 for none, and costs; see `pair_cost.find_partners`."""
+    """Return (n,) places of the cheapest partners of nodes, -1 for none, and costs; see `pair_merge.find_partners`."""
     partner, cost = np.empty(len(nodes), np.int32), np.empty(len(nodes), np.float32)
-    pair_cost.find_partners(len(nodes), rows, nodes, window, largest, partner, cost)
+    pair_merge.find_partners(len(nodes), rows, nodes, window, largest, partner, cost)
     return partner, cost
 
 
@@ -321,11 +320,11 @@ def matched(
         rest: (n - P,) uint32, the list in its order; a merged node replaces the first of its pair.
     """
     counts = np.empty((blocks, 2), np.int64)
-    pair_cost.count_pairs(blocks, partner, cost, limit, counts)
+    pair_merge.count_pairs(blocks, partner, cost, limit, counts)
     ends = np.cumsum(counts, axis=0)
     found = int(ends[-1, 0])
     pairs, rest = np.empty((found, 2), np.uint32), np.empty(len(nodes) - found, np.uint32)
-    pair_cost.list_pairs(blocks, nodes, partner, cost, limit, made, ends - counts, pairs, rest)
+    pair_merge.list_pairs(blocks, nodes, partner, cost, limit, made, ends - counts, pairs, rest)
     return pairs, rest
 
 
@@ -424,7 +423,7 @@ def in_final_order(
     places = (getattr(out, name)[hidden:] for name in GEOMETRY)
     shown = order[hidden:]
     node_rows.fill_merged_splats(len(shown), shown, n, binary.row, binary.rows, curve.space, *places)
-    weight = binary.rows[binary.row[slots], pair_cost.WEIGHT]
+    weight = binary.rows[binary.row[slots], pair_merge.WEIGHT]
     binary.rows = rows = binary.rows[binary.row[slots[:0] if goal.is_whole else slots]]  # frees what is not returned
     weights = np.empty(binary.used, np.float32)
     weights[:n], weights[inner] = binary.weight, weight

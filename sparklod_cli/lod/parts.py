@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from ..model.falloff import harmonic
 from ..model.gaussian import covariance, rotation_matrices, spark_size
 from ..model.lod_tree import LodTree
+from ..model.scene import DetailScene, TileScene
 from ..model.splats import FloatArray, Splats
-from ..model.traversed import DetailScene, TileScene
 from ..system.errors import InvalidSplatsError
 from ..system.progress import Progress, silent
 from .kernels.tree_links import find_parents
-from .part_settings import DetailSettings, TileSettings
+from .tree_settings import DetailSettings, TileSettings
 
 #: Half a bound's side for one splat, in standard deviations. Tools bound a splat by the box of one standard deviation
 #: along its own axes, rotated; no multiple of the ellipsoid's box below sqrt(3) encloses that box however it is turned.

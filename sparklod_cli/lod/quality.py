@@ -1,10 +1,10 @@
 """The quality builder: a binary tree made by merging the cheapest pairs, pruned to its most useful nodes.
 
 1. Leaves join level by level, from small to large. The active nodes are sorted along a Morton curve, and each finds its
-   cheapest partner among its neighbours on it (`kernels/pair_cost.py`). Of the pairs that chose each other, the cheaper
-   half are merged, all at once. The curve is shifted from round to round, and its seams with it.
-2. A merged node covers the union of its two nodes (`kernels/pair_merge.py`), and is drawn with the opacity profile that
-   has this coverage (`kernels/profile.py`).
+   cheapest partner among its neighbours on it. Of the pairs that chose each other, the cheaper half are merged, all at
+   once (`kernels/pair_merge.py`). The curve is shifted from round to round, and its seams with it.
+2. A merged node covers the union of its two nodes, and is drawn with the opacity profile that has this coverage
+   (`kernels/geometry.py`).
 3. The binary tree's least useful nodes are dropped (`kernels/prune.py`).
 
 benchmarks/notes/quality-builder.md has the reasons, and the alternatives that were tried.
@@ -28,9 +28,7 @@ from ..model.lod_tree import LodTree
 from ..model.splats import FloatArray, Splats
 from ..system.progress import Progress, silent
 from ..system.threads import threads_for
-from .builders import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
-from .check import Bounds, check
-from .kernels import pair_cost
+from .kernels import pair_merge
 from .kernels.sort import Nodes
 from .pair_tree import (
     BinaryTree,
@@ -43,7 +41,8 @@ from .pair_tree import (
     lowest_level,
     merge_levels,
 )
-from .stage_records import NO_FAMILY, STAGE_BITS, Pending, Region, StageFamilies
+from .stages import NO_FAMILY, STAGE_BITS, Bounds, Pending, Region, StageFamilies, check
+from .tree_settings import DEFAULT_GROWTH, MAX_GROWTH, MIN_GROWTH
 
 #: For each node that a stage hands on, it leaves this many times what the growth allows for a leaf to those above it:
 #: more than once, as the pruning of a stage adds to what it hands on. Measured: once loses up to 0.3 dB.
@@ -174,7 +173,7 @@ def advance(
         index = curve.order(splats.center, threads)
         nodes = _Nodes.of(pending, index, plan)
         binary = BinaryTree.of_leaves(nodes.rows, nodes.size)
-        nodes = replace(nodes, rows=np.empty((0, pair_cost.WIDTH), np.float32))  # the tree writes over them
+        nodes = replace(nodes, rows=np.empty((0, pair_merge.WIDTH), np.float32))  # the tree writes over them
         left = merge_levels(binary, nodes.level, curve, region, progress)
         goal = _pruning_goal(nodes, len(left[0]), region, plan)
         final = in_final_order(binary, index, dict(vars(splats)), goal, plan.curve, progress)

@@ -23,7 +23,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,12 +33,10 @@ from ..model.lod_tree import LodTree
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, threads_for
-from .builders import DEFAULT_BASE, MAX_BASE, MIN_BASE
-from .check import Bounds, check
 from .kernels.cell_pairs import SPAN, merge_in_cells, split_families
 from .kernels.geometry import SplatColumns
 from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors
-from .kernels.pair_cost import WEIGHT, WIDTH
+from .kernels.pair_merge import WEIGHT, WIDTH
 from .kernels.sort import (
     AXIS_BITS,
     PART_BITS,
@@ -50,9 +48,8 @@ from .kernels.sort import (
     sort_by_cell,
     sort_by_key,
 )
-
-if TYPE_CHECKING:  # builds in memory do without
-    from .stage_records import Margins, Pending, Region, StageFamilies
+from .stages import NO_FAMILY, STAGE_BITS, Bounds, Margins, Pending, Region, StageFamilies, check
+from .tree_settings import DEFAULT_BASE, MAX_BASE, MIN_BASE
 
 #: Level of splats that have not joined the tree yet: they do so at the level of their size.
 NEW = -1
@@ -189,7 +186,7 @@ class NodeRows(NamedTuple):
     """Columns of n nodes without a parent.
 
     Attributes:
-        node: (n, WIDTH) float32 node rows of `kernels/pair_cost.py`.
+        node: (n, WIDTH) float32 node rows of `kernels/pair_merge.py`.
         number: (n,) uint32 place of a given node among these; of a merged node, where its children begin, as a distance
             from the end of the final order.
         children: (n,) uint16 number of children that it was given here; 0 for a given node.
@@ -443,8 +440,6 @@ def plan(bounds: Bounds, sample: Splats, setting: float) -> VoxelGrid:
 
 def leaves(splats: Splats, index: NDArray[np.int64], plan: VoxelGrid) -> Pending:
     """See `StagedBuilder`; these splats have not joined the tree."""
-    from .stage_records import NO_FAMILY, Pending
-
     n = len(splats)
     rows, every = np.empty((n, WIDTH), np.float32), np.arange(n, dtype=np.uint32)
     columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
@@ -460,8 +455,6 @@ def advance(
 
     Families with the same batch and key come from one stage: a stable sort keeps them as they are.
     """
-    from .stage_records import NO_FAMILY, STAGE_BITS, Margins, Pending, StageFamilies
-
     given = dict(pending.columns)
     del pending
     with threads_for(len(given["level"])) as threads:
@@ -509,8 +502,6 @@ def _tree(given: dict[str, NDArray[Any]], grid: VoxelGrid, threads: int) -> tupl
     New splats have the first numbers, by level, curve and index, as in memory; then come other splats, then merged
     ones. The node rows of `given` are removed, so that they are freed when all splats have joined.
     """
-    from .stage_records import NO_FAMILY
-
     is_new = given["level"] == NEW
     new, old = (np.flatnonzero(mask).astype(np.uint32) for mask in (is_new, ~is_new))
     index, order = given["index"][new], None

@@ -17,8 +17,8 @@ from .foveation import Foveation
 from .scene import Scene
 
 if TYPE_CHECKING:
+    from .scene import DetailScene, TileScene
     from .transforms import Transform
-    from .traversed import DetailScene, TileScene
 
     Source = Path | Scene | DetailScene | TileScene
 
@@ -52,7 +52,7 @@ class Instance:
         if isinstance(self.source, str):
             object.__setattr__(self, "source", Path(self.source))
         if not isinstance(self.source, (Path, Scene)):
-            from .traversed import DetailScene, TileScene
+            from .scene import DetailScene, TileScene
 
             if not isinstance(self.source, (DetailScene, TileScene)):
                 raise TypeError(f"an instance is of a file or a scene, not of {type(self.source).__name__}")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
 from ..lod.kernels import cut_statistics as kernels
-from ..lod.kernels.cut_arrays import CutNodes
+from ..lod.kernels.cut import CutNodes
 from ..model import TOTAL
 from ..system.output import write_file
 from ..system.progress import Progress, silent

@@ -20,8 +20,8 @@ from ..codecs.rad.rad_header import RadHeader
 from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
 from ..io.local_files import open_plain
 from ..io.reading import read_parts, read_scene
+from ..model.scene import DetailScene, TileScene
 from ..model.splats import Splats
-from ..model.traversed import DetailScene, TileScene
 from ..system.errors import InvalidSplatsError, UnreadableError, naming, reason_of
 from ..system.progress import Progress, silent
 from .files import ShownFile

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..lod.parts import PIXEL_ERROR
-from ..model.traversed import TileScene
+from ..model.scene import TileScene
 from .cut import Forest, TreeCut, TreeInstance
 from .loaded_scene import TILES, Index, LoadedScene, bytes_of, cut_of_runs
 from .viewer_settings import CESIUM_FETCHERS

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..lod.kernels.cut_arrays import BUCKET_BITS, BUCKETS
+from ..lod.kernels.cut import BUCKET_BITS, BUCKETS
 from ..lod.kernels.pixel_scale import pixel_scales
 from ..lod.kernels.tree_links import find_depths, find_limits, find_parents
 from ..model.gaussian import linear_opacity, lod_opacity

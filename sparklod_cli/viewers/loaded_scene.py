@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 
 from ..codecs.formats import PRECISIONS
 from ..model.gaussian import spark_size
-from ..model.lod_tree import CHUNK_NODES, LodTree
+from ..model.lod_tree import CHUNK_NODES, LodTree, Nodes
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, Splats
-from ..model.tree_nodes import Nodes
 from .cut import Forest, TreeCut, TreeInstance, views_of
 from .spark import header_answers
 from .viewer_settings import FETCHERS
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
-    from ..model.file_coding import FileCoding
+    from ..model.scene import FileCoding
 
 Index = NDArray[np.signedinteger]
 

@@ -17,11 +17,10 @@ from ..cameras.framing import SAMPLE, USED, Balls, balls_of
 from ..codecs.rad.rad_reader import RadReader
 from ..io.rad_file import reopened
 from ..lod.kernels.pixel_scale import NODE
-from ..model.file_coding import FileCoding
 from ..model.instances import Instance
-from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
+from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree, Nodes
+from ..model.scene import FileCoding
 from ..model.splats import COLUMNS, Splats
-from ..model.tree_nodes import Nodes
 from ..system.errors import TreeError, naming
 from ..system.machine import available_memory
 from ..system.threads import ordered_map

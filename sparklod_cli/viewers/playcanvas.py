@@ -21,7 +21,7 @@ from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.streamed_manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..codecs.streamed_sog import layout_of
 from ..io.opening import opened
-from ..model.traversed import DetailScene
+from ..model.scene import DetailScene
 from ..system.errors import FormatError
 from .cut import Forest, TreeCut, TreeInstance
 from .loaded_scene import STREAMED_SOG, Index, LoadedScene, bytes_of, cut_of_runs

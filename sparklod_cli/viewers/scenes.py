@@ -36,7 +36,7 @@ from .spark import SparkViewer
 from .viewer_settings import PLAYCANVAS_BUDGET, LodSettings
 
 if TYPE_CHECKING:
-    from ..model.traversed import DetailScene, TileScene
+    from ..model.scene import DetailScene, TileScene
     from .continuous import BlendedCut, ContinuousCuts
     from .paging import Pages
 
@@ -392,7 +392,7 @@ def _loaded_runs(
     file: Path | None, found: DetailScene | TileScene, through: str | None, chunks: int, threads: int
 ) -> LoadedScene:
     """Return all tiles, or all levels and the environment, as one scene with its files."""
-    from ..model.traversed import DetailScene, TileScene
+    from ..model.scene import DetailScene, TileScene
 
     splats = found.splats
     if isinstance(found, DetailScene) and found.environment is not None:

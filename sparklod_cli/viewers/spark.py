@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..lod.kernels import cut_arrays
+from ..lod.kernels import cut
 from ..lod.kernels.cut import find_cut
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES
 from .cut import Forest, TreeCut, TreeInstance, views_of
@@ -33,10 +33,10 @@ READ_SHARE = 0.5
 
 #: Why a cut is not finer, by the kernel's code.
 REASONS = {
-    cut_arrays.BUDGET: "budget",
-    cut_arrays.PIXEL: "pixel",
-    cut_arrays.MISSING: "missing",
-    cut_arrays.EXHAUSTED: "exhausted",
+    cut.BUDGET: "budget",
+    cut.PIXEL: "pixel",
+    cut.MISSING: "missing",
+    cut.EXHAUSTED: "exhausted",
 }
 
 
@@ -90,29 +90,29 @@ class SparkViewer:
         """Return the cut with these chunks, which are in memory."""
         start = time.perf_counter()
         views = views_of(self.forest, self.instances, view)
-        trees = cut_arrays.Trees(self._nodes, views, present, CHUNK_BITS)
-        stop = cut_arrays.Stop(np.float32(smallest).view(np.int32), budget)
+        trees = cut.Trees(self._nodes, views, present, CHUNK_BITS)
+        stop = cut.Stop(np.float32(smallest).view(np.int32), budget)
         room = min(budget, self._most) + 1  # the kernel writes one more before it knows whether that is drawn
-        nodes = cut_arrays.CutNodes(np.empty(room, np.uint32), np.empty(room, np.int32), np.empty(room, np.uint16))
+        nodes = cut.CutNodes(np.empty(room, np.uint32), np.empty(room, np.int32), np.empty(room, np.uint16))
         demand, memory = np.empty(len(present), np.float32), self._memory
         slots, guess = getattr(memory, "slots", None), np.float32(getattr(memory, "guess", 0.0))
         size = VISITS * budget + CHUNK_NODES
         while True:
             size = min(size, 2 * self._most)  # a node is visited by its threshold, and once more by the queue
             if slots is None or len(slots.node) <= size:
-                slots = memory.slots = cut_arrays.Slots(
+                slots = memory.slots = cut.Slots(
                     node=np.empty(size + 1, np.uint32),
                     instance=np.empty(size + 1, np.uint16),
-                    sums=np.empty(cut_arrays.BUCKETS, np.int32),
-                    tally=np.empty(cut_arrays.TALLIES, np.int64),
+                    sums=np.empty(cut.BUCKETS, np.int32),
+                    tally=np.empty(cut.TALLIES, np.int64),
                     **{name: np.empty(size + 1, np.int32) for name in ("limit", "first", "queue", "pending", "heap")},
                 )
             selected, reason, missing, least, last = find_cut(trees, stop, guess, slots, demand, nodes)
-            if reason != cut_arrays.FULL:
+            if reason != cut.FULL:
                 break
             size = 2 * len(slots.node)
         # The next cut is likely to be similar.
-        memory.guess = GUESS * float(least) if reason == cut_arrays.BUDGET else smallest
+        memory.guess = GUESS * float(least) if reason == cut.BUDGET else smallest
         at = None
         if last >= 0:
             at = float(slots.limit.view(np.float32)[last]), int(slots.instance[last]), int(slots.node[last])

@@ -16,8 +16,7 @@ import sparklod_cli as sparklod
 from fuzz.laws import check_passes
 from sparklod_cli.codecs.formats import MANIFEST
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, SogOptions
-from sparklod_cli.lod.builders import METHODS
-from sparklod_cli.lod.part_settings import DetailSettings
+from sparklod_cli.lod.tree_settings import METHODS, DetailSettings
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS

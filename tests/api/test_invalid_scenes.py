@@ -17,7 +17,7 @@ from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.codecs.formats import ENCODINGS, MANIFEST, WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.spark_codings import SplatEncoding
-from sparklod_cli.lod.part_settings import DetailSettings
+from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import InvalidSplatsError, TreeError

@@ -11,7 +11,7 @@ import pytest
 import sparklod_cli as sparklod
 from sparklod_cli.api.files import Tree
 from sparklod_cli.codecs.formats import MANIFEST
-from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sparklod_cli.bake import estimate
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.fitting.settings import FitSettings
-from sparklod_cli.lod.builders import METHODS, bytes_of
+from sparklod_cli.lod.tree_settings import METHODS, bytes_of
 from sparklod_cli.model import MAX_SH_DEGREE
 from sparklod_cli.system import machine
 from sparklod_cli.system.errors import OutOfMemoryError

@@ -13,7 +13,7 @@ from sparklod_cli.codecs import encoder
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.lod import quick
-from sparklod_cli.model.node_stream import NodeStream
+from sparklod_cli.model.lod_tree import NodeStream
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import OutputError
 from sparklod_cli.system.progress import silent

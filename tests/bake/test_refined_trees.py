@@ -20,7 +20,7 @@ from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.fitting import fit, pictures
 from sparklod_cli.fitting.settings import SHARES, FitSettings
 from sparklod_cli.io.reading import read_parts, read_scene
-from sparklod_cli.lod.part_settings import DetailSettings
+from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
 from sparklod_cli.system.output import write_file

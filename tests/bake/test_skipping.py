@@ -12,7 +12,7 @@ from sparklod_cli.bake import identity, skipping
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
-from sparklod_cli.lod.part_settings import DetailSettings
+from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.system.errors import OutputError
 from tests.conftest import FIXTURES
 

@@ -13,7 +13,7 @@ from sparklod_cli.bake.simplifying import SimplifyGoal
 from sparklod_cli.codecs.options import RadOptions, SogOptions, WriteOptions
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod.budget import parse_budget
-from sparklod_cli.lod.part_settings import DetailSettings, TileSettings
+from sparklod_cli.lod.tree_settings import DetailSettings, TileSettings
 from tests.conftest import FIXTURES
 
 CODES = WriteOptions(rad=RadOptions(sh_codes=64), sog=SogOptions(64))

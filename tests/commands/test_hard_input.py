@@ -23,7 +23,7 @@ import pytest
 from fixtures import by_hand
 from sparklod_cli.cli import run
 from sparklod_cli.io.reading import read_scene
-from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.model.splats import COLUMNS
 from tests.conftest import FIXTURES, Capture
 from tests.scenes import splat_columns

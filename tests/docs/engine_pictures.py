@@ -17,7 +17,7 @@ from PIL import Image
 
 import sparklod_cli
 from sparklod_cli.io.reading import read_scene
-from sparklod_cli.lod.part_settings import TileSettings
+from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, ROOT
 from tests.interop.engines import recipes

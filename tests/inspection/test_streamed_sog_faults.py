@@ -23,7 +23,7 @@ from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io.reading import read_parts
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import parts, quick
-from sparklod_cli.lod.part_settings import DetailSettings
+from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.system.errors import FormatError
 from tests.inspection.streamed_sog_files import COUNTS, Folder, Node, folder, regions, splats
 from tests.inspection.test_schema import faults as schema_faults

@@ -21,8 +21,8 @@ from sparklod_cli.codecs.tileset import ERRORS, WARNINGS
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import quality
-from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.parts import make_tiles
+from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from tests.codecs.cases import linear
 from tests.conftest import FIXTURES

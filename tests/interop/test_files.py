@@ -10,7 +10,7 @@ import pytest
 
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.model.lod_tree import MAX_CHILDREN
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats

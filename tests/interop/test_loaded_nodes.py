@@ -19,10 +19,9 @@ from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.gaussian import linear_opacity, spark_size
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.lod_tree import CHUNK_NODES
+from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import FloatArray
-from sparklod_cli.model.tree_nodes import Nodes
 from sparklod_cli.viewers.cut import TreeInstance
 from sparklod_cli.viewers.loaded_scene import nodes_of
 from sparklod_cli.viewers.scenes import read_scenes

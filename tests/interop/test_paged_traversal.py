@@ -15,9 +15,8 @@ from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.lod_tree import CHUNK_NODES
+from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.model.tree_nodes import Nodes
 from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.scenes import read_scenes

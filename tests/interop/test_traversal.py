@@ -16,8 +16,7 @@ import pytest
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.foveation import Cones
-from sparklod_cli.model.lod_tree import CHUNK_NODES
-from sparklod_cli.model.tree_nodes import Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance, views_of
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit

@@ -28,7 +28,7 @@ from sparklod_cli import read, write
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cli import run
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.part_settings import TileSettings
+from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.view.site import CDN, CESIUM, MODULES, PACKAGES, PLAYCANVAS, THREE, VERSIONS

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sparklod_cli.lod.check import check
-from sparklod_cli.lod.stage_records import NO_FAMILY, STAGE_BITS, Pending, Region, StagedBuilder, StageFamilies
+from sparklod_cli.lod.stages import NO_FAMILY, STAGE_BITS, Pending, Region, StagedBuilder, StageFamilies, check
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.progress import silent

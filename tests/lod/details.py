@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.model.traversed import DetailScene
+from sparklod_cli.model.scene import DetailScene
 from tests.lod.sights import CutView
 from tests.scenes import random_splats
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sparklod_cli.lod.check import check
-from sparklod_cli.lod.stage_records import Pending, Region, StagedBuilder
+from sparklod_cli.lod.stages import Pending, Region, StagedBuilder, check
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
 from tests.lod.assembled import EVERYWHERE, Stages, assemble

@@ -9,8 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from sparklod_cli.model.foveation import Cones, Frustum
-from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.tree_nodes import Nodes
+from sparklod_cli.model.lod_tree import LodTree, Nodes
 from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from tests.lod.sights import CutView

@@ -7,8 +7,8 @@ from importlib import import_module
 
 import pytest
 
-from sparklod_cli.lod.builders import BUILDERS, METHODS
-from sparklod_cli.lod.check import check as check_input
+from sparklod_cli.lod.stages import check as check_input
+from sparklod_cli.lod.tree_settings import BUILDERS, METHODS
 from sparklod_cli.system.errors import InvalidSplatsError
 from tests.lod.assembled import run_stages
 from tests.lod.trees import check_colours, check_threads, check_tree, hard_cases

@@ -19,9 +19,8 @@ from sparklod_cli.lod.kernels.chunk_sets import LANES, fill_demand
 from sparklod_cli.lod.kernels.pixel_scale import NODE
 from sparklod_cli.lod.kernels.tree_links import find_limits, find_parents
 from sparklod_cli.model.gaussian import spark_size
-from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
+from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree, Nodes
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.model.tree_nodes import Nodes
 from sparklod_cli.system.threads import on_threads
 from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.model.tree_nodes import Nodes
+from sparklod_cli.model.lod_tree import Nodes
 from sparklod_cli.simulation.frames import Changes, CutStatistics, measure
 from sparklod_cli.viewers.cut import TreeCut, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.lod.kernels.tree_links import find_parents
-from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.lod.parts import (
     COARSE_ENOUGH,
     SIBLINGS,
@@ -25,10 +24,11 @@ from sparklod_cli.lod.parts import (
     shares_of,
     with_plain_opacity,
 )
+from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.gaussian import covariance, spark_size
 from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.traversed import DetailScene
 from tests.lod.trees import children, hard_cases, sorted_rows
 from tests.scenes import random_splats
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.model import tree_nodes
+from sparklod_cli.model import lod_tree
 from sparklod_cli.viewers import spark as traversal
 from sparklod_cli.viewers.cut import Forest, TreeInstance
 from tests.lod.forests import Case, ancestors_drawn, cases, check, random_tree, transform
@@ -26,7 +26,7 @@ def small_chunks() -> Iterator[None]:
     """Small chunks, so that small trees have many."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(traversal, "CHUNK_BITS", SMALL)
-        for module in (traversal, tree_nodes):
+        for module in (traversal, lod_tree):
             patch.setattr(module, "CHUNK_NODES", 1 << SMALL)
         yield
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.lod.part_settings import MOST_LEVELS, DetailSettings, parse_levels
+from sparklod_cli.lod.tree_settings import MOST_LEVELS, DetailSettings, parse_levels
 
 
 def test_shares_of_levels_are_read() -> None:

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod import quality
-from sparklod_cli.lod.check import check as check_input
 from sparklod_cli.lod.kernels.prune import MOST_CHILDREN
-from sparklod_cli.lod.stage_records import Pending, Region
+from sparklod_cli.lod.stages import Pending, Region
+from sparklod_cli.lod.stages import check as check_input
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.progress import silent

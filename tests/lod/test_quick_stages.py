@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.check import check as check_input
-from sparklod_cli.lod.stage_records import Region
+from sparklod_cli.lod.stages import Region
+from sparklod_cli.lod.stages import check as check_input
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.splats import COLUMNS, Splats
 from tests.lod.assembled import check_families, run_stages

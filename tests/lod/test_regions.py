@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.part_settings import DetailSettings
 from sparklod_cli.lod.parts import EXTENT, beyond, divide, extents, middle_of, united
+from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.gaussian import covariance, rotation_matrices
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import InvalidSplatsError

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import parts, quality
-from sparklod_cli.lod.part_settings import TileSettings
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.model.traversed import TileScene
+from sparklod_cli.lod.tree_settings import TileSettings
+from sparklod_cli.model.scene import Scene, TileScene
 from sparklod_cli.viewers.cesium import CesiumViewer, LoadedTiles, choose
 from sparklod_cli.viewers.cut import Forest, TreeInstance
 from sparklod_cli.viewers.viewer_settings import pixel_limit

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sparklod_cli.lod import quality, quick
-from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.parts import PIXEL_ERROR, RefinementOrder, extents, make_tiles, tile_cuts, with_plain_opacity
+from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
+from sparklod_cli.model.scene import TileScene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.traversed import TileScene
 from sparklod_cli.system.threads import on_threads
 from tests.lod.test_detail_levels import leaves_under
 from tests.lod.trees import hard_cases, sorted_rows

@@ -12,8 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.model.foveation import Cones, Frustum
-from sparklod_cli.model.lod_tree import CHUNK_NODES
-from sparklod_cli.model.tree_nodes import Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from sparklod_cli.viewers.cut import Forest, TreeInstance, views_of
 from sparklod_cli.viewers.spark import VISITS
 from sparklod_cli.viewers.viewer_settings import pixel_limit

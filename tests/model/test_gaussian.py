@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.kernels import geometry, profile
+from sparklod_cli.lod.kernels import geometry
 from sparklod_cli.model import gaussian
 from sparklod_cli.render.kernels import ellipse, project
 from tests.scenes import random_splats
@@ -43,7 +43,7 @@ def test_kernels_have_the_opacities_of_numpy() -> None:
     one, e = np.float32(1), np.float32(np.e)
     back = [project.linear_opacity_above_1(value, one, e) for value in d]
     np.testing.assert_allclose(back, gaussian.linear_opacity(d), rtol=1e-6)
-    found = [profile.lod_opacity_above_1(float(value), 1.0, np.e) for value in opacity]
+    found = [geometry.lod_opacity_above_1(float(value), 1.0, np.e) for value in opacity]
     np.testing.assert_allclose(found, d, rtol=1e-6)
 
 

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sparklod_cli.model.georeference import FLATTENING, RADIUS, place_of, placed
+from sparklod_cli.model.transforms import FLATTENING, RADIUS, earth_matrix, place_of
 
 DEGREES = st.floats(-89.9, 89.9)
 
 
 def matrix_of(*place: float) -> np.ndarray:
-    return np.array(placed(*place)).reshape(4, 4).T
+    return np.array(earth_matrix(*place)).reshape(4, 4).T
 
 
 def position(latitude: float, longitude: float, height: float) -> np.ndarray:
@@ -49,7 +49,7 @@ def test_the_axes_are_east_north_and_up_turned_by_the_heading(
 
 @given(DEGREES, st.floats(-179.9, 179.9), st.floats(-1000, 1e6), st.floats(0.1, 359.9))
 def test_a_place_is_found_again(latitude: float, longitude: float, height: float, heading: float) -> None:
-    found = place_of(placed(latitude, longitude, height, heading))
+    found = place_of(earth_matrix(latitude, longitude, height, heading))
     assert (found.latitude, found.longitude) == pytest.approx((latitude, longitude), abs=1e-9)
     assert (found.height, found.heading) == pytest.approx((height, heading), abs=1e-5)
 

@@ -13,7 +13,7 @@ import pytest
 import sparklod_cli as sparklod
 from fixtures import by_hand_ksplat, by_hand_splat
 from sparklod_cli.cli import run
-from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import REASONS, Selection
 from sparklod_cli.model.splats import INVALID, Splats

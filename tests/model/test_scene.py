@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.model.traversed import DetailScene
+from sparklod_cli.model.scene import DetailScene
 from tests.scenes import random_splats
 
 #: Three regions at two levels; the last one has no coarse level.

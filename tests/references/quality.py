@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from sparklod_cli.lod.kernels.pair_cost import (
+from sparklod_cli.lod.kernels.pair_merge import (
     CENTER,
     COLOR,
     COLOR_COST,

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from sparklod_cli.api import viewing
-from sparklod_cli.lod.part_settings import TileSettings
+from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.view.server import Server
 from sparklod_cli.view.site import FILES, LICENSES, MODULES, VERSIONS, Site
 from tests.conftest import FIXTURES

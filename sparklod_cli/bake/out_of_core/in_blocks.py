@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from ...codecs.reader import Reader
 from ...codecs.statistics import Statistics
-from ...lod.builders import BUILDERS
-from ...lod.check import INVISIBLE, Bounds
-from ...lod.stage_records import NO_FAMILY, Pending
+from ...lod.stages import INVISIBLE, NO_FAMILY, Bounds, Pending
+from ...lod.tree_settings import BUILDERS
 from ...model.selection import REASONS, SelectionTally
 from ...model.sh import width_of
 from ...model.splats import FloatArray, Splats

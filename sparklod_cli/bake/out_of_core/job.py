@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...codecs.reader import Reader
-from ...lod.stage_records import Region, StagedBuilder
+from ...lod.stages import Region, StagedBuilder
 from ...model.splats import FloatArray
 from ...system import machine
 from ...system.progress import Progress, silent

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...codecs.encoder import windows_of
-from ...lod.builders import BUILDERS
 from ...lod.chunk_order import MOST_FAMILIES, band_order, family_order
 from ...lod.kernels.tree_links import find_limits
-from ...lod.stage_records import NO_FAMILY, STAGE_BITS
-from ...model.lod_tree import CHUNK_NODES, LodTree
-from ...model.node_stream import NodeStream
+from ...lod.stages import NO_FAMILY, STAGE_BITS
+from ...lod.tree_settings import BUILDERS
+from ...model.lod_tree import CHUNK_NODES, LodTree, NodeStream
 from ...model.scene import rotated_axis
 from ...model.sh import degree_of, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats

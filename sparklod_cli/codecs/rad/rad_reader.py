@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...model import MAX_SH_DEGREE
-from ...model.file_coding import PLAIN_SCALES, FileCoding, ScaleCoding
 from ...model.lod_tree import LodTree
-from ...model.scene import Scene
+from ...model.scene import PLAIN_SCALES, FileCoding, ScaleCoding, Scene
 from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.errors import FormatError, TooLongError, TruncatedError

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from ...model.lod_tree import CHUNK_NODES, LodTree
-from ...model.node_stream import NodeStream
+from ...model.lod_tree import CHUNK_NODES, LodTree, NodeStream
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats

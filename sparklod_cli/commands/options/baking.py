@@ -14,7 +14,7 @@ from ...codecs.formats import MANIFEST, TILESET, WRITABLE, ending_of
 from ...codecs.formats import RAD_SUFFIX as RAD
 from ...codecs.options import MAX_SH_CODES, SH_CODES, RadOptions, SogOptions, WriteOptions
 from ...fitting import FIT_DEVICE_HELP, SEED, SEED_HELP, STEPS
-from ...lod.builders import (
+from ...lod.tree_settings import (
     BUILDERS,
     DEFAULT_BASE,
     DEFAULT_GROWTH,
@@ -24,8 +24,9 @@ from ...lod.builders import (
     METHODS,
     MIN_BASE,
     MIN_GROWTH,
+    DetailSettings,
+    TileSettings,
 )
-from ...lod.part_settings import DetailSettings, TileSettings
 from ...model import MAX_SH_DEGREE, UP_AXES
 from ...render import DEVICES
 from ...system.addresses import Place

@@ -5,7 +5,7 @@ side, in its own cell only, and pairs that chose each other become one node that
 merged into one during all rounds of a level become a family. As nothing outside a cell matters, a tree can be built in
 parts.
 
-Node rows are those of `pair_cost.py`. The cells of a span of nodes are worked on together, in columns, so that LLVM
+Node rows are those of `pair_merge.py`. The cells of a span of nodes are worked on together, in columns, so that LLVM
 vectorizes over nodes; results do not depend on how cells are put together.
 """
 
@@ -18,8 +18,7 @@ import numpy as np
 from ...system.fast_math import exp2
 from ...system.jit import b1, f4, i8, kernel, out, u4
 from .geometry import ellipsoid_area
-from .pair_cost import COVARIANCE, COVERED, DENSITY, LOG_DET, NEVER, WEIGHT, WIDTH, log_det, pair_costs
-from .pair_merge import semi_axes
+from .pair_merge import COVARIANCE, COVERED, DENSITY, LOG_DET, NEVER, WEIGHT, WIDTH, log_det, pair_costs, semi_axes
 
 f32 = np.float32
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...model.falloff import DRAWN_AREA
 from ...system.jit import f4, f8, fields, i4, i8, kernel, out, prefetch, u2, u4
-from .cut_arrays import BUCKET_BITS, BUCKETS, LEAF, CutNodes
+from .cut import BUCKET_BITS, BUCKETS, LEAF, CutNodes
 from .pixel_scale import NEAREST, NODES, ONE, VIEWS, ZERO
 
 #: Columns of the counts of an instance: nodes of each kind; least, sum and largest of their depths; area covered.

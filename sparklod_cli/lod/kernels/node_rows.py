@@ -1,6 +1,6 @@
 """Node rows from splats, merged splats from node rows, Morton codes of nodes, and columns in the final order.
 
-Arrays that kernels share: `rows`, node rows (see `pair_cost.py`); nodes from `leaves` on are merged; `row` (nodes -
+Arrays that kernels share: `rows`, node rows (see `pair_merge.py`); nodes from `leaves` on are merged; `row` (nodes -
 leaves,), the row of each merged node; `order` (M,), the node of each final index; `index` (n,), the input splat of each
 leaf.
 """
@@ -13,9 +13,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...system.jit import f4, f8, fields, i8, kernel, out, prefetch, u2, u4, u8
-from .geometry import LARGEST, ROWS, SCALE_FLOOR, SplatColumns, covariance, decompose, ellipsoid_area
-from .pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
-from .profile import is_needle, profile_of
+from .geometry import (
+    LARGEST,
+    ROWS,
+    SCALE_FLOOR,
+    SplatColumns,
+    covariance,
+    decompose,
+    ellipsoid_area,
+    is_needle,
+    profile_of,
+)
+from .pair_merge import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, log_det
 from .sort import interleave
 
 #: Bits per axis of a node's Morton code: 39 bits are sorted in four passes. Chosen.

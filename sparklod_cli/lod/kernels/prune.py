@@ -4,7 +4,7 @@ A node is drawn while the traversal's threshold is between its size and its pare
 children by one splat, at the cost of some error; its usefulness is the span of ln(size) over which that happens x (k -
 1 - error cost) x a rarity weight. When a node is dropped, its children become its parent's.
 
-Arrays are those of `pruning.fill_usefulness_terms` and `pruning.drop_nodes`: nodes from `leaves` on, of T, are merged.
+Arrays are those of `pair_tree.fill_usefulness_terms` and `drop_nodes`: nodes from `leaves` on, of T, are merged.
 Blocks of a range are of about one size; there are as many as rows of `counts`, which is added to.
 """
 
@@ -48,7 +48,7 @@ ABOVE_ALL = np.float32(1e6)
 #: Span of ln(size) of a node whose parent is that root. The mean is 0.26 before pruning and 0.43 after it, measured.
 UNKNOWN_SPAN = np.float32(0.3)
 
-#: Taken off such a root's count in `saved` of `pruning.drop_nodes`, so that it may have any number of children.
+#: Taken off such a root's count in `saved` of `pair_tree.drop_nodes`, so that it may have any number of children.
 ROOM = 1 << 30
 
 #: The rank of a node that is dropped.
@@ -177,7 +177,7 @@ def drop_below(threshold, most, leaves, children, parent, log_size, weight, kept
 
 @kernel(i8, i8, i4[:], out(u4[:]), ranges=True)
 def skip_dropped(start, stop, leaves, saved, parent):
-    """Update the parents of leaves and of merged nodes that are kept; arguments of `pruning.drop_nodes`."""
+    """Update the parents of leaves and of merged nodes that are kept; arguments of `pair_tree.drop_nodes`."""
     for node in range(start, stop):
         if node < leaves or saved[node - leaves] != -1:
             find_parent(node, leaves, saved, parent)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ...model.splats import FloatArray
 from ...system.jit import f4, f8, i4, i8, kernel, out, u4, u8
-from .pair_cost import CENTER
 
 Keys = NDArray[np.uint64]
 Nodes = NDArray[np.uint32]
@@ -67,7 +66,7 @@ def fill_cell_words(start, stop, geometry, nodes, step, low, word, words):
     """Fill one 63-bit word of the Morton code of each node's cell.
 
     Args:
-        geometry: node rows of `pair_cost.py`; or any whose first columns are the centre.
+        geometry: node rows of `pair_merge.py`, or any array whose first columns are the centre.
         nodes: (n,) rows of it.
         step: edge of a cell.
         low: (3,) the lowest cell on each axis, so that offsets from it are not negative.
@@ -75,7 +74,7 @@ def fill_cell_words(start, stop, geometry, nodes, step, low, word, words):
     """
     shift = np.uint64(AXIS_BITS * word)
     for i in range(start, stop):
-        x, y, z = geometry[nodes[i], CENTER], geometry[nodes[i], CENTER + 1], geometry[nodes[i], CENTER + 2]
+        x, y, z = geometry[nodes[i], 0], geometry[nodes[i], 1], geometry[nodes[i], 2]
         words[i] = morton_code(np.float64(x), np.float64(y), np.float64(z), step, low, shift)
 
 
@@ -191,7 +190,7 @@ def split_box(nodes, geometry, below, above):
     inside, outside = np.empty(len(nodes), np.uint32), np.empty(len(nodes), np.uint32)
     n = m = 0
     for i in range(len(nodes)):
-        x, y, z = geometry[nodes[i], CENTER], geometry[nodes[i], CENTER + 1], geometry[nodes[i], CENTER + 2]
+        x, y, z = geometry[nodes[i], 0], geometry[nodes[i], 1], geometry[nodes[i], 2]
         if below[0] < x < above[0] and below[1] < y < above[1] and below[2] < z < above[2]:
             inside[n] = nodes[i]
             n += 1

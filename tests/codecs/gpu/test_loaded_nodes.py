@@ -15,11 +15,9 @@ from sparklod_cli.codecs.formats import LOADED
 from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
 from sparklod_cli.codecs.spark_codings import SplatEncoding, log_scale_table
 from sparklod_cli.lod import quick
-from sparklod_cli.model.file_coding import PLAIN_SCALES, SPZ_SCALES, FileCoding, ScaleCoding
-from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.lod_tree import LodTree, Nodes
+from sparklod_cli.model.scene import PLAIN_SCALES, SPZ_SCALES, FileCoding, ScaleCoding, Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.model.tree_nodes import Nodes
 from tests.scenes import random_splats
 
 SPZ = FileCoding((SPZ_SCALES,))

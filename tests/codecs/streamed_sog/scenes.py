@@ -10,8 +10,8 @@ import numpy as np
 
 from sparklod_cli.codecs import streamed_sog as codec
 from sparklod_cli.codecs.options import DEFAULTS
-from sparklod_cli.lod.part_settings import DetailSettings
-from sparklod_cli.model.traversed import DetailScene
+from sparklod_cli.lod.tree_settings import DetailSettings
+from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.system.errors import FormatError
 from tests.scenes import random_splats
 

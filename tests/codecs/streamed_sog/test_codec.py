@@ -17,9 +17,8 @@ from sparklod_cli.codecs import streamed_sog as codec
 from sparklod_cli.codecs.merging import SceneFiles
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import linear
 from tests.codecs.test_laws import assert_close

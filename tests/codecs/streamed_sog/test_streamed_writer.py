@@ -17,9 +17,8 @@ from sparklod_cli.codecs.streamed_manifest import parse
 from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.model import morton
-from sparklod_cli.model.scene import Scene
+from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.traversed import DetailScene
 from sparklod_cli.system.errors import FormatError
 from tests.outputs import write_files
 

@@ -20,12 +20,11 @@ from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.tileset import LARGEST
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.lod import quality
-from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.parts import make_tiles
-from sparklod_cli.model.scene import AXES, Scene
+from sparklod_cli.lod.tree_settings import TileSettings
+from sparklod_cli.model.scene import AXES, Scene, TileScene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
-from sparklod_cli.model.traversed import TileScene
 from sparklod_cli.system.errors import FormatError, VersionError
 from tests.codecs.cases import linear
 from tests.codecs.streamed_sog.scenes import open_companion

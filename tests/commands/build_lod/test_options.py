@@ -13,7 +13,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.io.reading import read_scene
-from sparklod_cli.lod.builders import METHODS
+from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform

@@ -17,7 +17,7 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.commands.render import render as command
-from sparklod_cli.lod.part_settings import TileSettings
+from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.render import renderer
 from sparklod_cli.render.rasterizer import Image, ShadedSplats

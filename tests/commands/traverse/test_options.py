@@ -13,7 +13,7 @@ from sparklod_cli.codecs import spz
 from sparklod_cli.commands.traverse import traverse as command
 from sparklod_cli.figures import charts
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.part_settings import TileSettings
+from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from tests.commands.render.test_options import GIVEN as OF_RENDER
 from tests.conftest import FIXTURES, Capture

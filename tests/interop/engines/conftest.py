@@ -21,9 +21,9 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import parts, quality
-from sparklod_cli.lod.part_settings import DetailSettings
+from sparklod_cli.lod.tree_settings import DetailSettings
+from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.model.traversed import DetailScene
 from tests.conftest import FIXTURES
 from tests.interop import npm
 from tests.interop.engines import PACKAGES, recipes

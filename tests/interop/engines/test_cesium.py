@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.codecs.formats import TILESET
 from sparklod_cli.io.reading import read_parts, read_scene
-from sparklod_cli.lod.part_settings import TileSettings
 from sparklod_cli.lod.parts import PIXEL_ERROR
+from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.viewers.cesium import choose
 from sparklod_cli.viewers.viewer_settings import pixel_limit

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sparklod_cli.lod.kernels import node_rows, pair_cost, profile
+from sparklod_cli.lod.kernels import geometry, node_rows, pair_merge
 from sparklod_cli.lod.kernels.geometry import SplatColumns
 from sparklod_cli.lod.kernels.node_rows import merge_colors
-from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVERED, DENSITY, WEIGHT
+from sparklod_cli.lod.kernels.pair_merge import CENTER, COLOR, COVERED, DENSITY, WEIGHT
 from sparklod_cli.model.gaussian import spark_size
 from tests.references import gaussians
 from tests.references import quality as twin
@@ -18,7 +18,7 @@ from tests.scenes import random_splats
 def test_rows_of_leaves_are_their_splats_in_units() -> None:
     splats = random_splats(100, seed=9)
     index = np.random.default_rng(1).permutation(100).astype(np.uint32)
-    rows = np.zeros((120, pair_cost.WIDTH), np.float32)
+    rows = np.zeros((120, pair_merge.WIDTH), np.float32)
     middle, unit = np.array([0.5, -1.0, 2.0]), 2.0**-6
     columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
     size = np.zeros(120, np.float32)
@@ -42,9 +42,9 @@ def test_merged_nodes_are_drawn_with_the_variance_and_coverage_of_their_rows() -
     middle, unit = np.array([0.5, -1.0, 2.0]), 2.0**-6
     out = random_splats(100, seed=11)
     before = out.take(np.arange(100))
-    space, geometry = node_rows.Space(middle, unit), (out.center, out.scale, out.quat_xyzw, out.opacity)
+    space, columns = node_rows.Space(middle, unit), (out.center, out.scale, out.quat_xyzw, out.opacity)
     row = np.random.default_rng(3).permutation(60).astype(np.uint32)  # of nodes 40 to 99
-    node_rows.fill_merged_splats(100, order, 40, row, rows, space, *geometry)
+    node_rows.fill_merged_splats(100, order, 40, row, rows, space, *columns)
     for i, node in enumerate(order):
         if node < 40:  # a leaf
             assert np.array_equal(out.center[i], before.center[i])
@@ -52,8 +52,8 @@ def test_merged_nodes_are_drawn_with_the_variance_and_coverage_of_their_rows() -
             continue
         drawn = rows[row[node - 40]]
         np.testing.assert_allclose(out.center[i], drawn[CENTER : CENTER + 3] * unit + middle, rtol=1e-5)
-        opacity, spread = profile.profile_of(
-            float(drawn[DENSITY]), profile.is_needle(*np.linalg.eigvalsh(twin.matrix(drawn)))
+        opacity, spread = geometry.profile_of(
+            float(drawn[DENSITY]), geometry.is_needle(*np.linalg.eigvalsh(twin.matrix(drawn)))
         )
         assert out.opacity[i] == pytest.approx(opacity)
         covariance = twin.matrix(drawn) * unit**2 / spread

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.kernels import pair_cost
-from sparklod_cli.lod.kernels.pair_cost import COVARIANCE, LOG_DET
+from sparklod_cli.lod.kernels import pair_merge
+from sparklod_cli.lod.kernels.pair_merge import COVARIANCE, LOG_DET
 from sparklod_cli.lod.pair_tree import matched, partners
 from tests.references import quality as twin
 
@@ -17,17 +17,17 @@ NO_LIMIT = np.float32(np.inf)
 
 def test_the_logarithm_of_a_determinant_is_numpys() -> None:
     for row in twin.random_rows(200, seed=1):
-        assert pair_cost.log_det(*row[COVARIANCE : COVARIANCE + 6]) == pytest.approx(row[LOG_DET], abs=1e-4)
+        assert pair_merge.log_det(*row[COVARIANCE : COVARIANCE + 6]) == pytest.approx(row[LOG_DET], abs=1e-4)
 
 
 @pytest.mark.parametrize("flat", [(1.0, 1.0, 0.0), (1.0, 0.0, 0.0), (1e-30, 0.0, 0.0), (0.0, 0.0, 0.0)])
 def test_the_logarithm_of_the_determinant_of_what_is_flat_is_finite(flat: tuple[float, float, float]) -> None:
     zero = np.float32(0)
-    assert np.isfinite(pair_cost.log_det(*np.float32(flat), zero, zero, zero))
+    assert np.isfinite(pair_merge.log_det(*np.float32(flat), zero, zero, zero))
 
 
 @pytest.mark.parametrize("largest", [np.inf, 8.0])
-@pytest.mark.parametrize(("count", "window"), [(1, 4), (2, 4), (5, 12), (60, 3), (200, 12), (pair_cost.BLOCK + 40, 5)])
+@pytest.mark.parametrize(("count", "window"), [(1, 4), (2, 4), (5, 12), (60, 3), (200, 12), (pair_merge.BLOCK + 40, 5)])
 def test_the_cheapest_partner_is_that_of_brute_force(count: int, window: int, largest: float) -> None:
     rows = twin.random_rows(count, seed=count)
     nodes = np.random.default_rng(count).permutation(count).astype(np.uint32)
@@ -47,7 +47,7 @@ def test_the_cheapest_of_all_pairs_is_mutual() -> None:
 
 
 def test_among_equal_rows_half_find_each_other() -> None:
-    for count in (2, 3, 100, pair_cost.BLOCK + 1, 3 * pair_cost.BLOCK + 7):
+    for count in (2, 3, 100, pair_merge.BLOCK + 1, 3 * pair_merge.BLOCK + 7):
         rows = np.repeat(twin.random_rows(1, seed=3), count, axis=0)
         nodes = np.arange(count, dtype=np.uint32)
         found, _ = matched(nodes, *partners(rows, nodes, 12, NO_LIMIT), NO_LIMIT, count, 2)

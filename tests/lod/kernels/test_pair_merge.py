@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.lod.kernels import pair_merge, profile
-from sparklod_cli.lod.kernels.pair_cost import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH
+from sparklod_cli.lod.kernels import geometry, pair_merge
+from sparklod_cli.lod.kernels.pair_merge import CENTER, COLOR, COVARIANCE, COVERED, DENSITY, LOG_DET, WEIGHT, WIDTH
 from sparklod_cli.lod.pair_tree import BinaryTree
 from sparklod_cli.model.gaussian import lod_opacity
 from tests.references import gaussians
@@ -200,7 +200,7 @@ def test_pairs_become_rows_that_cover_as_much_and_are_as_large_as_they_are_drawn
         axes = np.sqrt(np.linalg.eigvalsh(twin.matrix(row)))
         assert row[DENSITY] == pytest.approx(row[COVERED] / gaussians.ellipsoid_area(axes), rel=1e-5)
         assert row[LOG_DET] == pytest.approx(np.linalg.slogdet(twin.matrix(row))[1], abs=1e-4)
-        opacity, spread = profile.profile_of(float(row[DENSITY]), profile.is_needle(*axes**2))
+        opacity, spread = geometry.profile_of(float(row[DENSITY]), geometry.is_needle(*axes**2))
         larger = 1 + 0.7 * max(0.0, float(lod_opacity(np.float32([opacity]))[0]) - 1)
         assert seen == pytest.approx(2 * axes.mean() / math.sqrt(spread) * larger, rel=1e-5)
         assert off == pytest.approx(picture_error(a, b, row), rel=1e-6)

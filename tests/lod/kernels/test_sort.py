@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sparklod_cli.lod.kernels.pair_cost import CENTER, WIDTH
+from sparklod_cli.lod.kernels.pair_merge import CENTER, WIDTH
 from sparklod_cli.lod.kernels.sort import AXIS_BITS, PART_BITS, Parts, sort_by_cell, sort_by_key, split_box, spread_bits
 
 

@@ -1,4 +1,4 @@
-"""Records of builds in stages, which make a tree block by block where a scene does not fit into memory.
+"""Input check of builders, and records of builds in stages, block by block where a scene does not fit into memory.
 
 A stage takes the nodes of a region that have no parent yet, gives parents to the nodes whose siblings cannot lie
 outside of it, and hands on the others: first for each block of splats, then for regions of several blocks, and at last
@@ -10,17 +10,55 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.splats import COLUMNS, FloatArray, Splats
+from ..system.errors import InvalidSplatsError
 from ..system.progress import Progress
+from ..system.threads import BLOCK_ROWS, threads_for
+from .kernels.geometry import find_bounds
 from .kernels.sort import PART_BITS, Nodes, Parts, split_box
 
-if TYPE_CHECKING:
-    from .check import Bounds
+#: Message on splats without an opacity or a size, whose selection keeps them by mistake.
+INVISIBLE = "a splat is without opacity or scale: see Selection.apply"
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of a scene's splats.
+
+    Attributes:
+        low, high: (3,) float64 corners of the box of their centres, world units.
+        smallest, largest: range of their sizes, 2 * max(scale), world units.
+    """
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    smallest: float
+    largest: float
+
+    @classmethod
+    def of(cls, splats: Splats) -> Bounds:
+        """Return the bounds of splats; without any, the box is from infinity to minus infinity."""
+        low, high = np.empty((2, -(-len(splats) // BLOCK_ROWS), 4))
+        find_bounds(len(low), splats.center, splats.scale, low, high)
+        least, most = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
+        return cls(least[:3], most[:3], 2 * float(least[3]), 2 * float(most[3]))
+
+
+def check(splats: Splats) -> Bounds:
+    """Return the bounds of valid splats; raise `InvalidSplatsError` without any, or if one is invisible."""
+    if len(splats) == 0:
+        raise InvalidSplatsError("no splat is left to build a tree of")
+    with threads_for(len(splats)):
+        bounds = Bounds.of(splats)
+    if not (bounds.smallest > 0 and splats.opacity.min() > 0):
+        raise InvalidSplatsError(INVISIBLE)
+    return bounds
+
 
 #: Number of the family of a leaf, which has no children.
 NO_FAMILY = -1
