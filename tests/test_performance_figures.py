@@ -1,7 +1,4 @@
-"""Pages of performance are made of their templates and the committed figures; what is met or fell behind is computed.
-
-Nothing is timed here: figures are the committed ones, or made up.
-"""
+"""Figures of performance: their tables, goals and comparisons with earlier figures. Nothing is timed here."""
 
 from __future__ import annotations
 
@@ -32,16 +29,6 @@ def measured(modules: Any, rows: Sequence[Any], speed: float = 1.0, notes: Seque
     return made("2026-01-02", "a machine", 0.25, 7.0, calibration, calibration, rows, notes)
 
 
-def test_the_pages_are_what_their_templates_and_the_committed_figures_give(modules: Any, tmp_path: Path) -> None:
-    page = modules("page")
-    figures = modules("figures").read(BENCHMARKS / "figures.json")
-    assert figures, "figures.json is committed"
-    page.write_pages(tmp_path, figures)
-    for name in page.PAGES:
-        told = (tmp_path / name).read_text()
-        assert (ROOT / "docs" / name).read_text() == told, "run `python benchmarks/run_all.py --write-page`"
-
-
 def test_every_section_and_every_goal_has_a_place(modules: Any) -> None:
     page, goals, sections = modules("page"), modules("goal_list").GOALS, modules("sections").SECTIONS
     templates = "".join(map(page.template, page.PAGES))
@@ -50,20 +37,6 @@ def test_every_section_and_every_goal_has_a_place(modules: Any) -> None:
     assert {goal.section for goal in goals} <= {section.name for section in sections}
     assert all((goal.most is None) != (goal.least is None) for goal in goals), "one bound each"
     assert len({(goal.group, goal.text) for goal in goals}) == len(goals)
-
-
-def test_a_place_without_anything_to_put_there_is_told(modules: Any) -> None:
-    page = modules("page")
-    for text in ("{{ table nonsense }}", "{{ goals nonsense }}", "before {{ machine }}"):
-        with pytest.raises(page.TemplateError, match=r"nonsense|cannot fill in"):
-            page.page(text, {})
-
-
-def test_a_section_that_was_not_measured_says_so(modules: Any) -> None:
-    page = modules("page")
-    assert page.page("{{ table gradients }}\n", {}) == "*Not measured yet.*\n"
-    goals = page.page("{{ goals gradients }}", {})
-    assert goals.count("| not measured |") == 2
 
 
 def test_a_table_has_what_was_measured_and_how_fast_the_machine_was(modules: Any) -> None:
@@ -126,7 +99,7 @@ TABLES = {"judged": ("x_s", "peak_bytes"), "key": ("scene",), "columns": ()}
         ([], [1.4], 1.0, False),
     ],
 )
-def test_what_fell_behind_by_more_than_noise_is_found(
+def test_figures_that_fell_behind_by_more_than_noise_are_reported(
     modules: Any, before: list[float], now: list[float], speed: float, fell: bool
 ) -> None:
     row, table = modules("rows").Row, modules("rows").Table(**TABLES)
@@ -209,9 +182,3 @@ def test_a_section_that_fails_is_told_and_the_others_go_on(
     page.write_text("old")
     assert run_all.main() == 0
     assert "| 20,000 | 100.0 |" in page.read_text()
-
-
-def test_measured_processes_keep_bytecode(modules: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
-    took = modules("process").run([sys.executable, "-c", "import sys; print(sys.dont_write_bytecode)"])
-    assert took.output == "False\n"
