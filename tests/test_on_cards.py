@@ -10,7 +10,7 @@ import pytest
 
 from tests.cards import SIMULATE
 
-FOLDERS = "tests/render/cuda", "tests/fitting/cuda"
+FOLDERS = "tests/render/test_cards.py", "tests/fitting/cuda"
 
 #: Seconds, far above what either takes.
 PATIENCE = 500
@@ -36,9 +36,9 @@ def test_kernels_pass_in_the_simulator() -> None:
 
 @pytest.mark.slow
 def test_kernels_compile_for_a_card() -> None:
-    from tests.render.cuda.compile_kernels import MISSING
+    from tests.render.compile_kernels import MISSING
 
-    found = run("-m", "tests.render.cuda.compile_kernels", **{SIMULATE: "0"})
+    found = run("-m", "tests.render.compile_kernels", **{SIMULATE: "0"})
     if found.returncode == MISSING:
         pytest.skip(found.stdout.strip())
     assert found.returncode == 0, found.stdout[-1000:] + found.stderr[-4000:]

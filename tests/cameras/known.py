@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,7 @@ FOLDER = FIXTURES / "cameras"
 Vector = tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class Known:
+class Known(NamedTuple):
     """A camera: where it is, and what is to its right, below, and ahead, unit vectors."""
 
     position: Vector
@@ -47,6 +47,9 @@ KNOWN = (
 SIZE, FOCAL = (640, 480), 600.0
 FOV_Y = 2 * math.atan(240 / 600)
 
+#: From OpenCV's axes to OpenGL's.
+HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
+
 #: Out of the world of SuperSplat and splat-transform: half a turn about z.
 OUT_OF_PLAYCANVAS = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -64,6 +67,11 @@ def read_fixture(name: str, settings: Settings | None = None, *, format: str | N
 def text_file(text: str | bytes, name: str = "path.json") -> Files:
     """A file that is on no disk."""
     return Files(Path(name), {name: text.encode() if isinstance(text, str) else text})
+
+
+def read_json(root: Any, settings: Settings | None = None) -> CameraPath:
+    """The cameras of a JSON file."""
+    return read(text_file(json.dumps(root)), settings=settings)
 
 
 def pixel(camera: Camera, point: Vector) -> NDArray[np.float64]:

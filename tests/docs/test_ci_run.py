@@ -16,5 +16,5 @@ def test_tests_that_want_an_extra_are_slow_ones_which_ci_runs() -> None:
     paths = [path for path in (ROOT / "tests").rglob("test_*.py") if path != Path(__file__)]
     texts = {path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in paths}
     wanting = {name: text for name, text in texts.items() if WANTS.search(text)}
-    assert "tests/figures/test_charts.py" in wanting
+    assert "tests/images/test_figures.py" in wanting
     assert [name for name, text in wanting.items() if "pytest.mark.slow" not in text] == []

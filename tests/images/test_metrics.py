@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from sparklod_cli.images.metrics import (
-    C1,
     EDGE,
     MOST_PSNR,
     Tile,
@@ -54,10 +53,11 @@ def ssim_as_written(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.mean(values))
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
 @pytest.mark.parametrize("noise", [0.01, 0.1, 0.5])
-def test_ssim_is_the_formula_of_the_paper(noise: float) -> None:
-    a, b = pictures(noise=noise)
-    assert ssim(a, b) == pytest.approx(ssim_as_written(a, b), abs=1e-12)
+def test_ssim_is_the_formula_of_the_paper(noise: float, kind: type) -> None:
+    a, b = (image.astype(kind) for image in pictures(noise=noise))
+    assert ssim(a, b) == pytest.approx(ssim_as_written(a.astype(np.float64), b.astype(np.float64)), abs=1e-12)
 
 
 @pytest.mark.parametrize("size", [(45, 37), (11, 11), (43, 80), (100, 12)])
@@ -71,56 +71,31 @@ def test_ssim_is_that_of_scikit_image(size: tuple[int, int]) -> None:
     assert ssim(a, b) == pytest.approx(float(inside.mean()), abs=1e-9)
 
 
-def test_ssim_of_the_same_image_is_1_and_it_is_symmetric() -> None:
-    a, b = pictures()
+@pytest.mark.parametrize("size", [(45, 37), (7, 4)], ids=["image", "image smaller than the window"])
+def test_ssim_of_the_same_image_is_1_and_it_is_symmetric(size: tuple[int, int]) -> None:
+    a, b = pictures(*size)
     assert ssim(a, a) == pytest.approx(1, abs=1e-12)
     assert ssim(a, b) == pytest.approx(ssim(b, a), abs=1e-15)
-    assert ssim(a, b) > ssim(a, pictures(noise=0.3)[1])
+    assert ssim(a, pictures(*size, noise=0.3)[1]) < ssim(a, b) < 1
 
 
-def test_ssim_of_flat_images_compares_their_means_alone() -> None:
-    a, b = np.full((20, 20, 3), 0.25), np.full((20, 20, 3), 0.75)
-    assert ssim(a, b) == pytest.approx((2 * 0.25 * 0.75 + C1) / (0.25**2 + 0.75**2 + C1), abs=1e-12)
-
-
-def test_ssim_of_an_image_smaller_than_its_window_is_defined() -> None:
-    a, b = pictures(7, 4)
-    assert ssim(a, a) == pytest.approx(1, abs=1e-12)
-    assert -1 < ssim(a, b) < 1
-
-
-def test_ssim_of_float32_is_that_of_float64() -> None:
-    a, b = (image.astype(np.float32) for image in pictures())
-    assert ssim(a, b) == pytest.approx(ssim_as_written(a.astype(np.float64), b.astype(np.float64)), abs=1e-12)
-
-
-def test_psnr_of_a_known_difference() -> None:
+def test_psnr_of_known_differences() -> None:
     a = np.full((8, 8, 3), 0.5)
-    assert psnr(a, a + 0.1) == pytest.approx(20)
-    assert psnr(a, a + 1 / 255) == pytest.approx(20 * math.log10(255))
+    for difference, expected in ((0.1, 20), (1 / 255, 20 * math.log10(255)), (1e-4, 80), (1e-9, MOST_PSNR)):
+        assert psnr(a, a + difference) == pytest.approx(expected)
+    assert psnr(a, a) == MOST_PSNR
     b = a.copy()
     b[0, 0, 0] += 0.5  # one number of 192
     assert psnr(a, b) == pytest.approx(-10 * math.log10(0.25 / 192))
 
 
-def test_psnr_of_equal_images_is_the_largest() -> None:
-    a = np.full((8, 8, 3), 0.5)
-    assert psnr(a, a) == MOST_PSNR
-    assert psnr(a, a + 1e-9) == MOST_PSNR
-    assert psnr(a, a + 1e-4) == pytest.approx(80)
-
-
-def test_the_worst_tile_is_the_one_that_differs_most() -> None:
+def test_the_worst_tile_is_the_one_that_differs_most_and_the_first_of_equal_ones() -> None:
     a, b = pictures(150, 200)
     b[70:80, 140:150] = 1 - b[70:80, 140:150]
-    parts = {
-        (x, y): psnr(a[y : y + 64, x : x + 64], b[y : y + 64, x : x + 64])
-        for x in range(0, 200, 64)
-        for y in range(0, 150, 64)
-    }
     tile = worst_tile(a, b)
-    assert (tile.x, tile.y) == min(parts, key=lambda place: parts[place]) == (128, 64)
-    assert tile.psnr == pytest.approx(parts[128, 64])
+    assert (tile.x, tile.y) == (128, 64)
+    assert tile.psnr == pytest.approx(psnr(a[64:128, 128:192], b[64:128, 128:192]))
+    assert worst_tile(a, a) == Tile(MOST_PSNR, 0, 0)
 
 
 def test_a_tile_at_the_edge_counts_its_own_pixels_alone() -> None:
@@ -129,11 +104,6 @@ def test_a_tile_at_the_edge_counts_its_own_pixels_alone() -> None:
     b[64, 64] += 0.1
     b[0, 0] += 0.3
     assert worst_tile(a, b) == Tile(pytest.approx(20), 64, 64)
-
-
-def test_the_worst_tile_of_the_same_image_is_the_first() -> None:
-    a, _ = pictures()
-    assert worst_tile(a, a) == Tile(MOST_PSNR, 0, 0)
 
 
 def covered(gray: np.ndarray, alpha: float | np.ndarray = 1.0) -> np.ndarray:
@@ -175,24 +145,6 @@ def test_steps_of_a_fifth_of_the_range_are_edges(height: float) -> None:
         where = edges(covered(turned))
         along = where if turned is image else where.T
         assert along.any(axis=0).nonzero()[0].tolist() == ([] if height < 0.2 else [13, 14, 15, 16])
-
-
-def test_a_slope_is_an_edge_where_it_is_steep_in_any_direction() -> None:
-    y, x = np.mgrid[:60, :60] / 1.0
-    for angle in np.linspace(0, math.pi, 9):
-        ramp = math.cos(angle) * x + math.sin(angle) * y
-        for slope, strong in ((0.98, False), (1.02, True)):
-            light = 0.5 + slope * EDGE * (ramp - ramp.mean())
-            inside = edges(covered(np.clip(light, 0, 1)))[(light > 0.2) & (light < 0.8)]
-            assert inside.all() if strong else not inside.any(), angle
-
-
-def test_a_silhouette_is_an_edge_on_either_background() -> None:
-    """White splats have none on white, but do on black."""
-    alpha = np.zeros((20, 20))
-    alpha[5:15, 5:15] = 1
-    for gray in (0.0, 1.0):
-        assert edges(covered(np.full((20, 20), gray), alpha))[4, 10]
 
 
 def test_psnr_of_edges_counts_their_pixels_alone() -> None:

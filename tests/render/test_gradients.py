@@ -21,7 +21,7 @@ from sparklod_cli.render.rasterizer import ShadedSplats, shade
 from sparklod_cli.render.settings import SORTS, RasterSettings
 from sparklod_cli.system.threads import on_threads
 from tests.references import spark_pictures
-from tests.render.test_rasterizer import camera_at, joined, one, rows, shown
+from tests.render.drawables import camera_at, joined, one, rows, shown
 from tests.scenes import random_splats
 
 LOOK = RasterSettings()
@@ -33,9 +33,26 @@ STEP = 1e-5
 #: Largest difference to the twin's, as a share of the sum of what could cancel.
 MOST = 2e-3
 
+#: A camera of a small picture, as each of its gradients takes many pictures of the twin.
+SMALL = camera_at(size=(29, 19), focal=(30.0, 26.0))
 
-def in_float64(of: ShadedSplats) -> ShadedSplats:
-    return ShadedSplats(**{name: column.astype(np.float64) for name, column in vars(of).items()})
+
+def random_weights(camera: Camera, seed: int = 0) -> np.ndarray:
+    """Derivatives of a loss by a picture."""
+    return np.random.default_rng(seed).normal(size=(camera.height, camera.width, 4)).astype(np.float32)
+
+
+def gradients(of: ShadedSplats, camera: Camera, look: RasterSettings = LOOK) -> SplatGradients:
+    return draw(of, camera, look).gradients(random_weights(camera))
+
+
+def assert_equal(found: SplatGradients, expected: SplatGradients, index: np.ndarray | slice = slice(None)) -> None:
+    for name in PROPERTIES:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name)[index])
+
+
+def assert_finite(found: SplatGradients) -> None:
+    assert all(np.isfinite(getattr(found, name)).all() for name in PROPERTIES)
 
 
 def changed(of: ShadedSplats, by: Mapping[str, np.ndarray]) -> ShadedSplats:
@@ -61,12 +78,13 @@ def weights_of(twin: spark_pictures.Drawn, seed: int = 0) -> np.ndarray:
 
 
 def difference(of: ShadedSplats, camera: Camera, look: RasterSettings, by: Mapping[str, np.ndarray]) -> np.ndarray:
-    """How the twin's picture changes with a small change; where splats end is held."""
-    exact = in_float64(of)
+    """How the twin's picture changes with a small change of some properties; where splats end is held."""
+    exact = ShadedSplats(**{name: column.astype(np.float64) for name, column in vars(of).items()})
     held = spark_pictures.picture(exact, camera, look)
+    none = {name: np.zeros((len(of), 3)) for name in PROPERTIES} | {"lod_opacity": np.zeros(len(of))}
     more, less = (
         spark_pictures.picture(
-            changed(exact, {name: sign * STEP * by[name] for name in PROPERTIES}), camera, look, held
+            changed(exact, none | {name: sign * STEP * value for name, value in by.items()}), camera, look, held
         ).rgba
         for sign in (1, -1)
     )
@@ -74,17 +92,16 @@ def difference(of: ShadedSplats, camera: Camera, look: RasterSettings, by: Mappi
 
 
 def check(of: ShadedSplats, camera: Camera, look: RasterSettings = LOOK, *, seed: int = 0) -> None:
-    """Holds the gradients, one property at a time and in a random direction, against the twin."""
+    """Compare the gradient of one property at a time, in a random direction, with the twin's."""
     rng = np.random.default_rng(seed)
     weights = weights_of(spark_pictures.picture(of, camera, look), seed)
     found = draw(of, camera, look).gradients(weights)
-    none = {name: np.zeros(getattr(found, name).shape) for name in PROPERTIES}
     for name in PROPERTIES:
-        direction = rng.normal(size=none[name].shape)
+        direction = rng.normal(size=getattr(found, name).shape)
         if name == "center":
             direction *= of.scale.min()
         terms = getattr(found, name) * direction
-        expected = float((difference(of, camera, look, {**none, name: direction}) * weights).sum())
+        expected = float((difference(of, camera, look, {name: direction}) * weights).sum())
         assert terms.sum() == pytest.approx(expected, abs=MOST * np.abs(terms).sum() + 1e-6), name
 
 
@@ -95,8 +112,7 @@ def check(of: ShadedSplats, camera: Camera, look: RasterSettings = LOOK, *, seed
     sort=st.sampled_from(SORTS),
 )
 def test_gradients_are_finite_differences_of_the_twin(seed: int, most: float, scale: float, sort: str) -> None:
-    scene = shown(12, seed=seed, scale=scale, most=most)
-    check(scene, camera_at(size=(29, 19), focal=(30.0, 26.0)), RasterSettings(sort=sort), seed=seed)
+    check(shown(12, seed=seed, scale=scale, most=most), SMALL, RasterSettings(sort=sort), seed=seed)
 
 
 @pytest.mark.parametrize("most", [1.0, 5.0])
@@ -104,14 +120,13 @@ def test_each_value_of_a_gradient_is_that_of_the_twin(most: float) -> None:
     scene, camera = shown(4, seed=1, scale=0.15, most=most), camera_at(size=(23, 17), focal=(24.0, 24.0))
     weights = weights_of(spark_pictures.picture(scene, camera, LOOK))
     found = draw(scene, camera, LOOK).gradients(weights)
-    none = {name: np.zeros(getattr(found, name).shape) for name in PROPERTIES}
     for name in PROPERTIES:
         values = getattr(found, name).astype(np.float64)
         assert np.count_nonzero(values) > 0.7 * values.size
         for at in np.ndindex(values.shape):
-            direction = none[name].copy()
+            direction = np.zeros(values.shape)
             direction[at] = 1
-            expected = float((difference(scene, camera, LOOK, {**none, name: direction}) * weights).sum())
+            expected = float((difference(scene, camera, LOOK, {name: direction}) * weights).sum())
             assert values[at] == pytest.approx(expected, rel=MOST, abs=MOST * float(np.abs(values).max())), (name, at)
 
 
@@ -131,32 +146,28 @@ def test_colours_that_are_clamped_to_one_have_no_gradients() -> None:
     [by_rgb] = draw(scene, camera, LOOK).gradients(weights).rgb
     assert by_rgb[0] == 0
     np.testing.assert_allclose(by_rgb[1:], 0.9, atol=0.03)
-    check(shown(12, scale=0.2, most=3.0), camera_at(size=(29, 19), focal=(30.0, 26.0)))
-    bright = shown(12, scale=0.2, most=3.0)
-    bright.rgb[:] *= 3
-    check(bright, camera_at(size=(29, 19), focal=(30.0, 26.0)))
+    for brightest in (1.3, 3.9):
+        check(shown(12, scale=0.2, most=3.0, brightest=brightest), SMALL)
 
 
 def test_an_lod_opacity_above_five_has_no_gradient() -> None:
-    camera = camera_at(size=(29, 19), focal=(30.0, 26.0))
-    weights = weights_of(spark_pictures.picture(one((0, 0, 0), 0.3, 7.5, (1, 0.5, 0.2)), camera, LOOK))
-    five, more = (draw(one((0, 0, 0), 0.3, d, (1, 0.5, 0.2)), camera, LOOK).gradients(weights) for d in (5.0, 7.5))
+    weights = weights_of(spark_pictures.picture(one((0, 0, 0), 0.3, 7.5, (1, 0.5, 0.2)), SMALL, LOOK))
+    five, more = (draw(one((0, 0, 0), 0.3, d, (1, 0.5, 0.2)), SMALL, LOOK).gradients(weights) for d in (5.0, 7.5))
     assert five.lod_opacity[0] != 0 and more.lod_opacity[0] == 0
     np.testing.assert_array_equal(five.center, more.center)
 
 
-def test_splats_shortened_to_the_largest_radius_have_gradients_of_place_opacity_and_colour() -> None:
+def test_splats_shortened_to_the_largest_radius_have_gradients_of_opacity_and_colour() -> None:
     camera, look = camera_at(size=(57, 41)), replace(LOOK, max_radius=15.0)
     scene = shown(5, seed=3, scale=0.6, most=0.9)
     scene.center[:, :2] *= np.float32(0.3)
     weights = weights_of(spark_pictures.picture(scene, camera, LOOK))
     found = draw(scene, camera, look).gradients(weights)
-    for name in PROPERTIES:
-        assert np.isfinite(getattr(found, name)).all()
+    assert_finite(found)
     drawn = rasterizer.draw(scene, camera, look)
-    for name, column in (("lod_opacity", "lod_opacity"), ("rgb", "rgb")):
-        step = np.float32(1e-2) * np.random.default_rng(0).normal(size=getattr(scene, column).shape).astype(np.float32)
-        after = rasterizer.draw(replace(scene, **{column: getattr(scene, column) + step}), camera, look)
+    for name in ("lod_opacity", "rgb"):
+        step = np.float32(1e-2) * np.random.default_rng(0).normal(size=getattr(scene, name).shape).astype(np.float32)
+        after = rasterizer.draw(replace(scene, **{name: getattr(scene, name) + step}), camera, look)
         expected = float(((after - drawn).astype(np.float64) * weights).sum())
         assert (getattr(found, name) * step).sum() == pytest.approx(expected, rel=0.1)
 
@@ -170,36 +181,30 @@ def test_splats_that_are_not_drawn_have_no_gradients() -> None:
         one((0, 0, 0), 1e-6, 0.9, (1, 1, 1)),  # smaller than can be seen
         one((0, 0, 0), np.nan, 0.9, (1, 1, 1)),
     )
-    weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 4)).astype(np.float32)
-    alone, found = (draw(some, camera, LOOK).gradients(weights) for some in (scene, joined(hidden, scene)))
+    alone, found = gradients(scene, camera), gradients(joined(hidden, scene), camera)
     for name in PROPERTIES:
         values = getattr(found, name)
         assert not values[: len(hidden)].any()
         np.testing.assert_array_equal(values[len(hidden) :], getattr(alone, name))
+    assert gradients(shown(0), camera).center.shape == (0, 3)
 
 
-def test_what_an_opaque_splat_hides_has_no_gradient() -> None:
+def test_splats_hidden_by_an_opaque_one_have_no_gradients() -> None:
     """Tiles end where nothing is to be seen any more, as those of the picture do."""
     camera = camera_at((0, 0, 4), size=(32, 32))
     walls = joined(*(one((0, 0, 2.5 + k / 100), 2.0, 5.0, (0.2, 0.4, 0.6)) for k in range(20)))
     behind = shown(200, seed=4, spread=0.3)
-    weights = np.random.default_rng(0).normal(size=(32, 32, 4)).astype(np.float32)
     drawing = draw(joined(behind, walls), camera, LOOK)
     assert (drawing.drawn.stop < drawing.drawn.start[1:]).all()
-    found = drawing.gradients(weights)
-    for name in PROPERTIES:
-        assert not getattr(found, name)[: len(behind)].any()
-        assert np.isfinite(getattr(found, name)).all()
+    found = drawing.gradients(random_weights(camera))
+    assert not any(getattr(found, name)[: len(behind)].any() for name in PROPERTIES)
+    assert_finite(found)
     assert found.rgb[-1].any()
 
 
 @given(seed=st.integers(0, 1000), most=st.sampled_from([1.0, 5.0]), scale=st.sampled_from([1e-9, 0.01, 0.3, 8.0]))
 def test_gradients_are_finite(seed: int, most: float, scale: float) -> None:
-    scene, camera = shown(60, seed=seed, scale=scale, most=most), camera_at(size=(24, 20))
-    weights = np.random.default_rng(seed).normal(size=(20, 24, 4)).astype(np.float32)
-    found = draw(scene, camera, LOOK).gradients(weights)
-    for name in PROPERTIES:
-        assert np.isfinite(getattr(found, name)).all()
+    assert_finite(gradients(shown(60, seed=seed, scale=scale, most=most), camera_at(size=(24, 20))))
 
 
 @pytest.mark.parametrize("sort", SORTS)
@@ -210,40 +215,20 @@ def test_the_picture_is_the_rasterizer_s(sort: str) -> None:
 
 def test_a_drawing_outlives_the_next_picture() -> None:
     scene, camera = shown(300, most=3.0), camera_at()
-    weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 4)).astype(np.float32)
-    expected = draw(scene, camera, LOOK).gradients(weights)
-    drawing = draw(scene, camera, LOOK)
-    other = draw(shown(400, seed=1), camera_at((1, 2, 3)), LOOK)
-    other.gradients(weights)
-    found = drawing.gradients(weights)
-    for name in PROPERTIES:
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    expected, drawing = gradients(scene, camera), draw(scene, camera, LOOK)
+    gradients(shown(400, seed=1), camera_at((1, 2, 3)))
+    assert_equal(drawing.gradients(random_weights(camera)), expected)
 
 
-def test_threads_do_not_change_a_bit_of_a_gradient() -> None:
+def test_threads_and_the_order_of_splats_do_not_change_a_bit_of_a_gradient() -> None:
     scene, camera = shown(5000, most=3.0, seed=11), camera_at(size=(200, 150), focal=(200.0, 200.0))
-    weights = np.random.default_rng(0).normal(size=(150, 200, 4)).astype(np.float32)
-    found = []
-    for count in (1, 2):
-        with on_threads(count):
-            gradients = draw(scene, camera, LOOK).gradients(weights)
-        found.append([getattr(gradients, name).tobytes() for name in PROPERTIES])
-    assert found[0] == found[1]
-
-
-def test_the_order_of_splats_does_not_matter() -> None:
+    with on_threads(1):
+        expected = gradients(scene, camera)
+    with on_threads(2):
+        assert_equal(gradients(scene, camera), expected)
     scene, camera = shown(300, most=3.0, seed=12), camera_at()
     order = np.random.default_rng(0).permutation(len(scene))
-    weights = np.random.default_rng(0).normal(size=(camera.height, camera.width, 4)).astype(np.float32)
-    plain, mixed = (draw(some, camera, LOOK).gradients(weights) for some in (scene, rows(scene, order)))
-    for name in PROPERTIES:
-        np.testing.assert_array_equal(getattr(mixed, name), getattr(plain, name)[order])
-
-
-def test_an_empty_scene_has_empty_gradients() -> None:
-    camera = camera_at()
-    found = draw(shown(0), camera, LOOK).gradients(np.ones((camera.height, camera.width, 4), np.float32))
-    assert found.center.shape == (0, 3) and found.lod_opacity.shape == (0,)
+    assert_equal(gradients(rows(scene, order), camera), gradients(scene, camera), order)
 
 
 def test_the_profile_shifted_is_refused() -> None:

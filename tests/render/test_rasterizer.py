@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +12,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.cameras.camera import Camera, look_at
-from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.render.rasterizer import Image, ShadedSplats, draw, shade
+from sparklod_cli.render import rasterizer
+from sparklod_cli.render.kernels.project import GROUP, HALF_HEIGHT, HALF_WIDTH, LEAST, TILE, X, Y, exponent, index_of
+from sparklod_cli.render.kernels.raster import BLOCKS, LANES, measure
+from sparklod_cli.render.rasterizer import (
+    Image,
+    ShadedSplats,
+    draw,
+    project_splats,
+    shade,
+    sort_into_tiles,
+    tiles_across,
+)
 from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
 from sparklod_cli.system.threads import on_threads
 from tests.references import spark_pictures
+from tests.render.drawables import COLUMNS, camera_at, joined, one, rows, shown
 from tests.scenes import random_splats
 
 #: Largest difference to the twin, which computes in float64, at pixels of which float32 can tell what they are in.
@@ -27,55 +39,10 @@ LEAST_PSNR = 70.0
 EARLY = 1e-4
 
 
-def camera_at(
-    eye: tuple[float, float, float] = (0.3, -0.5, 4.0),
-    *,
-    size: tuple[int, int] = (57, 41),
-    focal: tuple[float, float] = (60.0, 52.0),
-    principal: tuple[float, float] | None = None,
-) -> Camera:
-    """Looks at the origin; y is down in the world."""
-    middle = (size[0] / 2, size[1] / 2)
-    return Camera(look_at(eye, (0, 0, 0), (0, -1, 0)), *size, focal, principal or middle)
-
-
-def shown(count: int, *, seed: int = 0, scale: float = 0.08, spread: float = 0.7, most: float = 1.0) -> ShadedSplats:
-    """Splats around the origin: scales over a decade, D up to `most`, colours up to 1.3."""
-    rng = np.random.default_rng(seed)
-    f32 = np.float32
-    return ShadedSplats(
-        center=rng.normal(0, spread, (count, 3)).astype(f32),
-        scale=(scale * np.exp(rng.normal(0, 0.8, (count, 3)))).astype(f32),
-        quat_xyzw=normalized_quat(rng.normal(size=(count, 4)).astype(f32)),
-        lod_opacity=rng.uniform(0, most, count).astype(f32),
-        rgb=rng.uniform(0, 1.3, (count, 3)).astype(f32),
-    )
-
-
-def joined(*parts: ShadedSplats) -> ShadedSplats:
-    names = [field.name for field in dataclasses.fields(ShadedSplats)]
-    return ShadedSplats(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
-
-
-def rows(of: ShadedSplats, index: np.ndarray | slice) -> ShadedSplats:
-    return ShadedSplats(**{field.name: getattr(of, field.name)[index] for field in dataclasses.fields(ShadedSplats)})
-
-
-def one(center: tuple[float, float, float], scale: float, d: float, rgb: tuple[float, float, float]) -> ShadedSplats:
-    columns = [center, (scale, scale, scale), (0, 0, 0, 1), d, rgb]
-    return ShadedSplats(*(np.array([column], np.float32) for column in columns))
-
-
 def check(
     of: ShadedSplats, camera: Camera, look: RasterSettings | None = None, *, most: float = MOST, unsure: float = 0.1
 ) -> Image:
-    """Holds a picture against the twin's.
-
-    Args:
-        of, camera, look: what is drawn.
-        most: the largest difference.
-        unsure: the share of pixels that may be left out, because a splat ends there.
-    """
+    """Compare a picture with that of the twin; `unsure` is the share of pixels in which a splat may end."""
     look = look or RasterSettings()
     image, twin = draw(of, camera, look), spark_pictures.picture(of, camera, look)
     assert image.shape == (camera.height, camera.width, 4) and image.dtype == np.float32
@@ -95,34 +62,64 @@ def test_pictures_are_those_of_the_twin(most: float, profile: str, sort: str) ->
         assert image[..., 3].mean() > 0.1
 
 
-@pytest.mark.parametrize("size", [(1, 1), (17, 33), (16, 16), (64, 3), (2, 70)])
-def test_pictures_of_any_size_are_those_of_the_twin(size: tuple[int, int]) -> None:
-    count = 10 if size == (1, 1) else 100  # so that no splat ends at that one pixel
-    check(shown(count, most=3.0), camera_at(size=size, focal=(0.8 * size[0], 0.8 * size[1])), unsure=0.3)
+def squeezed(of: ShadedSplats, *factors: float) -> ShadedSplats:
+    of.scale[:] *= np.float32(factors)
+    return of
 
 
-@pytest.mark.parametrize("principal", [(0.0, 0.0), (57.0, 10.0), (-20.0, 20.0), (28.0, 70.0)])
-def test_an_off_centre_principal_point_shifts_the_picture(principal: tuple[float, float]) -> None:
-    """What is dropped is told by where it is on the picture, not by its angle to the optical axis."""
-    image = check(shown(400, spread=1.5), camera_at(principal=principal))
-    assert image[..., 3].mean() > 0.02
-
-
-@pytest.mark.parametrize("most", [1.0, 5.0])
-def test_the_longest_needles_are_exact(most: float) -> None:
+def needles(most: float) -> ShadedSplats:
     """As long as a splat may be; in float32 the terms of a quadratic form would cancel to 1e-2."""
-    needles = shown(12, seed=5, spread=0.4, most=most)
-    needles.scale[:] = np.float32([2.0, 0.001, 0.001])
-    image = check(needles, camera_at(size=(960, 540), focal=(1500.0, 1500.0)), most=2e-4)
-    assert (image[..., 3] > 0.01).sum() > 300
+    of = shown(12, seed=5, spread=0.4, most=most)
+    of.scale[:] = np.float32([2.0, 0.001, 0.001])
+    return of
+
+
+def stack() -> ShadedSplats:
+    """Hundreds of splats behind each other, of which the last are never drawn."""
+    of = shown(600, seed=14, scale=0.4, spread=0.3)
+    of.lod_opacity[:] = np.random.default_rng(14).uniform(0.05, 0.6, 600)
+    return of
+
+
+LONG, WIDE = camera_at(size=(960, 540), focal=(1500.0, 1500.0)), camera_at(size=(1300, 40), focal=(600.0, 600.0))
+
+
+def small(width: int, height: int) -> Camera:
+    return camera_at(size=(width, height), focal=(0.8 * width, 0.8 * height))
+
+
+#: Splats, camera, arguments of `check`, and the least share of the picture that they cover.
+PICTURES: dict[str, tuple[ShadedSplats, Camera, dict[str, Any], float]] = {
+    "a pixel": (shown(10, most=3.0), small(1, 1), {"unsure": 0.3}, 0),  # few, so that no splat ends at the pixel
+    "tiles and a bit": (shown(100, most=3.0), small(17, 33), {"unsure": 0.3}, 0),
+    "a tile": (shown(100, most=3.0), small(16, 16), {"unsure": 0.3}, 0),
+    "low": (shown(100, most=3.0), small(64, 3), {"unsure": 0.3}, 0),
+    "narrow": (shown(100, most=3.0), small(2, 70), {"unsure": 0.3}, 0),
+    "axis at a corner": (shown(400, spread=1.5), camera_at(principal=(0.0, 0.0)), {}, 0.02),
+    "axis at a side": (shown(400, spread=1.5), camera_at(principal=(57.0, 10.0)), {}, 0.02),
+    "axis to the left": (shown(400, spread=1.5), camera_at(principal=(-20.0, 20.0)), {}, 0.02),
+    "axis below": (shown(400, spread=1.5), camera_at(principal=(28.0, 70.0)), {}, 0.02),
+    "needles": (needles(1.0), LONG, {"most": 2e-4}, 1e-5),
+    "needles, merged": (needles(5.0), LONG, {"most": 2e-4}, 1e-5),
+    "below a pixel": (shown(500, scale=0.003, seed=7), camera_at(), {}, 0),
+    "far below a pixel": (shown(500, scale=1e-9, seed=8), camera_at(), {}, 0),
+    "between near and far": (shown(300, seed=9), camera_at(), {"look": RasterSettings(near=3.7, far=4.3)}, 0),
+    "all around": (shown(300, seed=9), camera_at((0.01, 0.02, 0.1)), {"look": RasterSettings(near=0.2)}, 0),
+    "behind each other": (stack(), camera_at(size=(24, 20)), {"most": 2 * EARLY, "unsure": 0.5}, 0),
+}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_pictures_of_special_splats_and_cameras_are_those_of_the_twin(name: str) -> None:
+    splats, camera, how, least = PICTURES[name]
+    assert check(splats, camera, **how)[..., 3].mean() >= least
 
 
 @pytest.mark.parametrize("most", [1.0, 5.0])
 @pytest.mark.parametrize("thin", [1.0, 0.01])
 def test_no_splat_is_larger_than_512_pixels(thin: float, most: float) -> None:
-    huge = shown(6, seed=6, scale=6.0, spread=0.5, most=most)
-    huge.scale[:, 1:] *= np.float32(thin)
-    image = check(huge, camera_at(size=(1300, 40), focal=(600.0, 600.0)), unsure=0.3)
+    huge = squeezed(shown(6, seed=6, scale=6.0, spread=0.5, most=most), 1, thin, thin)
+    image = check(huge, WIDE, unsure=0.3)
     assert (image[:, :30, 3] == 0).any() and image[..., 3].max() > 0
 
 
@@ -131,35 +128,6 @@ def test_the_edge_of_a_huge_splat_is_512_pixels_from_its_centre() -> None:
     image = draw(one((0, 0, 0), 4.0, 1.0, (1, 1, 1)), camera, RasterSettings())
     [seen] = np.nonzero(image[4, :, 3])
     assert 511 <= 600 - seen.min() <= 512 and 511 <= seen.max() - 600 <= 512
-
-
-def test_splats_below_a_pixel_are_drawn_as_the_twin_draws_them() -> None:
-    """Blur makes them half a pixel large, and opacity as much lower."""
-    check(shown(500, scale=0.003, seed=7), camera_at())
-    check(shown(500, scale=1e-9, seed=8), camera_at())
-
-
-def test_splats_before_near_and_beyond_far_are_not_drawn() -> None:
-    look = RasterSettings(near=3.7, far=4.3)
-    near_and_far = shown(300, seed=9)
-    image = check(near_and_far, camera_at(), look)
-    assert not np.array_equal(image, draw(near_and_far, camera_at(), RasterSettings()))
-    inside = camera_at((0.01, 0.02, 0.1))  # splats are behind it, and all around it
-    check(near_and_far, inside, RasterSettings(near=0.2))
-    nothing = draw(near_and_far, camera_at(), RasterSettings(near=100.0, far=200.0))
-    assert not nothing.any()
-
-
-def test_a_splat_is_dropped_when_its_center_is_beyond_the_clip() -> None:
-    """A splat is drawn as long as its centre is within 1.4 times the picture's half width, and then not at all."""
-    camera = camera_at((0, 0, 5), size=(40, 30), focal=(50.0, 50.0))
-    for pixels, drawn in ((1.39 * 20, True), (1.41 * 20, False)):
-        for sign in (-1, 1):
-            image = draw(one((sign * pixels / 50 * 5, 0, 0), 1.0, 1.0, (1, 1, 1)), camera, RasterSettings())
-            assert image.any() == drawn
-    for pixels, drawn in ((1.39 * 15, True), (1.41 * 15, False)):
-        image = draw(one((0, pixels / 50 * 5, 0), 1.0, 1.0, (1, 1, 1)), camera, RasterSettings())
-        assert image.any() == drawn
 
 
 def test_an_lod_opacity_above_five_is_five() -> None:
@@ -226,45 +194,23 @@ def test_of_splats_in_one_place_the_last_is_in_front() -> None:
         np.testing.assert_allclose(middle[:3], np.eye(3)[seen], atol=1e-3)
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_an_opaque_near_splat_hides_all_behind_it(profile: str) -> None:
-    camera = camera_at((0, 0, 4))
-    wall = one((0, 0, 2.5), 2.0, 5.0, (0.2, 0.4, 0.6))
-    image = draw(joined(shown(200, spread=0.4), wall), camera, RasterSettings(profile=profile))
-    np.testing.assert_allclose(image, np.broadcast_to(np.float32([0.2, 0.4, 0.6, 1]), image.shape), atol=2 * EARLY)
-
-
-def test_the_two_sorts_differ() -> None:
-    """Off the axis, what is deeper may be nearer."""
-    camera = camera_at((0, 0, 4), size=(60, 40))
-    deep, wide = one((0.0, 0, 0.0), 0.3, 5.0, (1, 0, 0)), one((1.4, 0, 0.2), 0.5, 5.0, (0, 0, 1))
-    radial, along = (draw(joined(deep, wide), camera, RasterSettings(sort=sort)) for sort in ("radial", "z"))
-    assert (radial - along)[..., 0].max() > 0.3  # red is in front by distance, blue by depth
-
-
 @given(seed=st.integers(0, 1000), most=st.sampled_from([1.0, 5.0]), profile=st.sampled_from(PROFILES))
 def test_alpha_is_no_more_than_one(seed: int, most: float, profile: str) -> None:
     image = draw(shown(60, seed=seed, scale=0.3, most=most), camera_at(size=(24, 20)), RasterSettings(profile=profile))
     assert np.isfinite(image).all() and image.min() >= 0 and image[..., 3].max() <= 1
 
 
-def test_an_empty_scene_is_transparent() -> None:
-    assert not draw(shown(0), camera_at(), RasterSettings()).any()
-    no_splats = Splats(*(column[:0] for column in dataclasses.astuple(random_splats(1))))
-    assert not draw(shade([(no_splats, np.eye(4))], camera_at()), camera_at(), RasterSettings()).any()
-
-
-def test_splats_without_opacity_are_not_drawn() -> None:
-    scene = shown(200)
+def test_splats_without_opacity_are_not_drawn_and_no_splats_are_a_transparent_picture() -> None:
+    camera, look, scene = camera_at(), RasterSettings(), shown(200)
     faint = dataclasses.replace(scene, lod_opacity=np.zeros(200, np.float32))
-    assert not draw(faint, camera_at(), RasterSettings()).any()
-    np.testing.assert_array_equal(
-        draw(joined(scene, faint), camera_at(), RasterSettings()), draw(scene, camera_at(), RasterSettings())
-    )
+    no_splats = shade([(Splats.zeros(0, 0), np.eye(4))], camera)
+    for nothing in (faint, shown(0), no_splats):
+        assert not draw(nothing, camera, look).any()
+    np.testing.assert_array_equal(draw(joined(scene, faint), camera, look), draw(scene, camera, look))
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38, -3e38])
-@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(ShadedSplats)])
+@pytest.mark.parametrize("name", COLUMNS)
 def test_a_broken_splat_harms_no_other(name: str, value: float) -> None:
     """It is a small one; if it is drawn, then where it is."""
     scene, camera = shown(60, seed=13), camera_at()
@@ -277,9 +223,82 @@ def test_a_broken_splat_harms_no_other(name: str, value: float) -> None:
         assert (np.abs(image - unharmed).max(axis=-1) > 1e-6).mean() < 0.1
 
 
-def test_stopping_early_costs_no_more_than_it_may() -> None:
-    """Hundreds of splats behind each other, of which the last are never looked at."""
-    rng = np.random.default_rng(14)
-    stack = shown(600, seed=14, scale=0.4, spread=0.3)
-    stack.lod_opacity[:] = rng.uniform(0.05, 0.6, 600)
-    check(stack, camera_at(size=(24, 20)), most=2 * EARLY, unsure=0.5)
+# Tiles
+
+
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_a_tile_lists_the_splats_whose_boxes_overlap_it_from_near_to_far(blocks: int) -> None:
+    """Those that are not drawn have empty boxes, and no key."""
+    camera = camera_at(size=(200, 150), focal=(100.0, 100.0))
+    _, boxes, keys = project_splats(shown(500, spread=2.0, most=3.0), camera, RasterSettings())
+    across, down = tiles_across(camera)
+    start, splats = sort_into_tiles(boxes, keys, across, down, blocks)
+    order = [index_of(key) for key in keys]
+    assert 0 < len(order) < 500
+    for tile in range(across * down):
+        y, x = divmod(tile, across)
+        left, right, top, bottom = boxes[order].T
+        overlap = (left <= x) & (x <= right) & (top <= y) & (y <= bottom)
+        assert splats[start[tile] : start[tile + 1]].tolist() == np.array(order)[overlap].tolist()
+    hidden = np.setdiff1d(np.arange(500), order)
+    assert (boxes[hidden, 1] < boxes[hidden, 0]).all()
+
+
+def test_a_picture_with_more_tiles_than_their_numbers_hold_is_refused() -> None:
+    camera = camera_at(size=(rasterizer.MAX_SIDE + 1, 1))
+    with pytest.raises(ValueError, match="524,272 along a side"):
+        draw(shown(1), camera, RasterSettings())
+    widest = camera_at((0, 0, 5), size=(rasterizer.MAX_SIDE, 1), focal=(1e5, 1e5))
+    ends = joined(*(one((x, 0, 0), 0.01, 1.0, (1, 1, 1)) for x in (-13.1, 13.1)))
+    image = draw(ends, widest, RasterSettings())
+    assert image[0, :700].any() and image[0, -700:].any() and not image[0, 700:-700].any()
+
+
+@pytest.mark.parametrize("scale", [(0.08, 0.08, 0.08), (0.5, 0.0005, 0.0005), (8.0, 0.01, 0.01), (6.0, 3.0, 0.001)])
+def test_rows_beside_an_ellipse_are_those_without_a_pixel_of_it(scale: tuple[float, float, float]) -> None:
+    """From small splats to needles that are as long as a splat may be; and half of the box's rows are left out."""
+    splats = shown(120, seed=3, most=5.0)
+    splats.scale[:] = np.float32(scale)
+    camera = camera_at(size=(200, 150), focal=(300.0, 300.0))
+    kept = boxed = 0
+    screen, boxes, keys = project_splats(splats, camera, RasterSettings())
+    across, down = np.meshgrid(np.arange(TILE), np.arange(TILE))
+    for key in keys:
+        row, box = screen[index_of(key)], boxes[index_of(key)]
+        for left in range(0, camera.width, TILE):
+            for top in range(0, camera.height, TILE):
+                local, lines = row.copy(), np.empty((BLOCKS, 2), np.int32)
+                size = min(TILE, camera.height - top), min(TILE, camera.width - left)
+                measure(local, left, top, *size, lines)
+                inside = exponent(row, left + across + 0.5 - row[X], top + down + 0.5 - row[Y]) >= row[LEAST]
+                inside[size[0] :] = inside[:, size[1] :] = False
+                in_box = (box[0] * TILE <= left <= box[1] * TILE) and (box[2] * TILE <= top <= box[3] * TILE)
+                assert in_box or not inside.any(), (row[X], row[Y], left, top)
+                tall = np.abs(top + np.arange(TILE) + 0.5 - row[Y]) <= row[HALF_HEIGHT]
+                for block, (above, below) in enumerate(lines):
+                    assert 0 <= above <= TILE and 0 <= below <= size[0]
+                    drawn = np.flatnonzero(inside[:, LANES * block : LANES * (block + 1)].any(axis=1))
+                    assert not drawn.size or (above <= drawn[0] and drawn[-1] < below), (row[X], row[Y], left, top)
+                    first = left + LANES * block
+                    if first - row[HALF_WIDTH] <= row[X] <= first + LANES + row[HALF_WIDTH]:
+                        kept, boxed = kept + max(0, below - above), boxed + tall.sum()
+    assert kept < 0.95 * boxed
+
+
+@pytest.mark.parametrize("sort", SORTS)
+@pytest.mark.parametrize("scale", [0.08, 8.0])
+def test_a_splat_is_projected_alike_among_any_others(scale: float, sort: str) -> None:
+    """Small ones, and ones whose axes are shortened; D from 0 to 5; some beside the picture."""
+    camera, look, count = camera_at(), RasterSettings(sort=sort), 2 * GROUP + 7
+    scene = shown(count, scale=scale, spread=2.0, most=5.0)
+    screen, boxes, keys = project_splats(scene, camera, look)
+    drawn = sorted(index_of(key) for key in keys)
+    found = screen[drawn].copy(), boxes.copy()
+    assert 0 < len(drawn) < count
+    for size in (1, GROUP - 1, GROUP, GROUP + 1):
+        first = count - size
+        screen, boxes, keys = project_splats(rows(scene, slice(first, None)), camera, look)
+        kept = sorted(index_of(key) for key in keys)
+        assert [first + i for i in kept] == [i for i in drawn if i >= first]
+        np.testing.assert_array_equal(screen[kept], found[0][len(drawn) - len(kept) :])
+        np.testing.assert_array_equal(boxes, found[1][first:])

@@ -1,4 +1,4 @@
-"""Pictures that a card draws are those of the processor."""
+"""Pictures and gradients of a card are those of the processor."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.render import gradients as on_processor
 from sparklod_cli.render import rasterizer
+from sparklod_cli.render.kernels.backward import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
 from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade
 from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
 from tests.cards import MARKS
+from tests.render.drawables import psnr, shown
 
 pytestmark = MARKS
 
@@ -44,11 +47,6 @@ def camera_at(distance: float = 3.0, size: tuple[int, int] = (20, 12)) -> Camera
     return Camera.look_at([0.3, 0.2, -distance], [0, 0, 0], up=[0, -1, 0], fov_y=50, size=size)
 
 
-def agreement(image: np.ndarray, reference: np.ndarray) -> float:
-    """PSNR in dB."""
-    return float(-10 * np.log10(max(np.square(image.astype(np.float64) - reference).mean(), 1e-20)))
-
-
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("sort", SORTS)
 def test_a_picture_is_that_of_the_processor(profile: str, sort: str) -> None:
@@ -59,19 +57,18 @@ def test_a_picture_is_that_of_the_processor(profile: str, sort: str) -> None:
     image = draw_on_a_card(shaded, camera, settings)
     assert image.dtype == np.float32
     assert 0.1 < reference[..., 3].mean() < 0.99
-    assert agreement(image, reference) > LEAST
+    assert psnr(image, reference) > LEAST
 
 
 def test_near_far_and_large_splats_and_those_behind_are_drawn_likewise() -> None:
     shaded = shade([(splats_of(50, size=0.4), np.eye(4))], camera_at(0.3))
     settings = RasterSettings(near=0.2, far=1.0, max_radius=12.0)
     reference = rasterizer.draw(shaded, camera_at(0.3), settings)
-    assert agreement(draw_on_a_card(shaded, camera_at(0.3), settings), reference) > LEAST
+    assert psnr(draw_on_a_card(shaded, camera_at(0.3), settings), reference) > LEAST
 
 
 def test_no_splats_are_an_empty_picture() -> None:
-    empty = ShadedSplats(*(np.zeros((0, *shape), np.float32) for shape in ((3,), (3,), (4,), (), (3,))))
-    assert not draw_on_a_card(empty, camera_at(), RasterSettings()).any()
+    assert not draw_on_a_card(shown(0), camera_at(), RasterSettings()).any()
     behind = shade([(splats_of(5), np.eye(4))], camera_at(-9.0))
     assert not draw_on_a_card(behind, camera_at(-9.0, (17, 5)), RasterSettings(far=1.0)).any()
 
@@ -80,7 +77,7 @@ def test_a_device_of_settings_is_where_the_reference_draws() -> None:
     scene, settings = sparklod.Scene(splats_of(20, 1)), sparklod.RenderSettings(device="cuda")
     reference = sparklod.render(scene, camera_at())
     image = sparklod.render(scene, camera_at(), settings=settings)
-    assert agreement(image, reference) > LEAST
+    assert psnr(image, reference) > LEAST
     assert not np.array_equal(image, reference)  # sums of a card are in another order
 
 
@@ -95,4 +92,38 @@ def test_uploaded_splats_are_shaded_on_the_card(degree: int) -> None:
     d = lod_opacity(splats.opacity)
     uploaded = CardSplats.of(splats.center, splats.scale, splats.quat_xyzw, d, splats.rgb, splats.sh)
     drawn = draw_on_card(uploaded, to_card(some), CardView.of(camera, settings))
-    assert agreement(drawn.image.copy_to_host(), reference) > LEAST
+    assert psnr(drawn.image.copy_to_host(), reference) > LEAST
+
+
+COLUMNS = {
+    "center": slice(CENTER, CENTER + 3),
+    "log_scale": slice(LOG_SCALE, LOG_SCALE + 3),
+    "turn": slice(TURN, TURN + 3),
+    "lod_opacity": LOD_OPACITY,
+    "rgb": slice(RGB, RGB + 3),
+}
+
+
+#: Largest difference to the processor's, over the largest derivative of the property. Chosen: sums are of float32.
+MOST = 1e-3
+
+
+def test_gradients_are_those_of_the_processor() -> None:
+    from sparklod_cli.render.cuda.backward import BATCH, gradients_on_card
+    from sparklod_cli.render.cuda.card import to_card
+    from sparklod_cli.render.cuda.rasterizer import CardSplats, CardView, draw_on_card
+
+    splats, camera, settings = splats_of(40), camera_at(size=(18, 10)), RasterSettings(max_radius=25.0)
+    by_image = np.random.default_rng(1).normal(size=(camera.height, camera.width, 4)).astype(np.float32)
+    drawing = on_processor.draw(shade([(splats, np.eye(4))], camera), camera, settings)
+    reference = drawing.gradients(by_image)
+    d = lod_opacity(splats.opacity)
+    uploaded = CardSplats.of(splats.center, splats.scale, splats.quat_xyzw, d, splats.rgb, splats.sh)
+    view = CardView.of(camera, settings)
+    drawn = draw_on_card(uploaded, to_card(np.arange(len(splats), dtype=np.int32)), view)
+    assert np.diff(drawn.start.copy_to_host()).max() > BATCH
+    found = gradients_on_card(uploaded, drawn, view, to_card(by_image)).copy_to_host()
+    for name, columns in COLUMNS.items():
+        expected = getattr(reference, name)
+        assert np.abs(expected).max() > 0
+        assert np.abs(found[:, columns] - expected).max() < MOST * np.abs(expected).max(), name
