@@ -101,7 +101,6 @@ def test_files_of_the_same_name_have_different_addresses() -> None:
         ("sh1-sog/meta.json", r"zip its files into a \.sog$"),
         ("hand-spz.glb", r"hand-spz\.glb: PlayCanvas does not read the SPZ in it; write it with --glb"),
         ("sh2-gsplat.pt", r"gsplat\.pt: Spark does not read checkpoint; bake it first with sparklod"),
-        ("..", r"is a directory, without the meta\.json of an unpacked SOG, a lod-meta\.json or a tileset\.json$"),
         ("missing.spz", "missing.spz: "),
         ("../camera_files.py", "camera_files.py: "),
         ("/dev/null", "a pipe or a device"),
@@ -117,7 +116,10 @@ def test_files_of_different_engines_are_refused_together() -> None:
         shown_files([TREE, GOLDEN / "sh1-streamed-sog"])
 
 
-def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
+def test_a_folder_and_a_pipe_are_refused(tmp_path: Path) -> None:
+    names = r"the meta\.json of an unpacked SOG, a lod-meta\.json or a tileset\.json$"
+    with pytest.raises(FormatError, match=f"is a directory, without {names}"):
+        shown_files([tmp_path])
     os.mkfifo(tmp_path / "scene.spz")
     with pytest.raises(FormatError, match="a pipe or a device"):
         shown_files([tmp_path / "scene.spz"])
@@ -387,11 +389,11 @@ def keep_child_counts(path: Path) -> None:
 
 def test_the_options_of_the_first_look_and_a_camera_path_are_in_the_settings() -> None:
     look, path = ((1.0, 2.0, 3.0), (0.0, 0.0, 0.0)), FIXTURES / "cameras" / "sparklod.json"
-    settings = settings_of(TREE, look_at=look, fov=40.0, up=(0.0, 0.0, 1.0), budget=500, camera_path=path)
+    settings = settings_of(TREE, look_at=look, fov=40.0, up=(0.0, 0.0, 1.0), budget=500)
     start = settings["start"]
     assert (start["eye"], start["target"], start["fov"], start["chosen"]) == ([1, 2, 3], [0, 0, 0], 40, False)
     assert (settings["up"], settings["budget"]) == ([0, 0, 1], 500)
-    assert len(settings["path"]["frames"]) == len(sparklod.read_cameras(path))
+    assert len(settings_of(TREE, camera_path=path)["path"]["frames"]) == len(sparklod.read_cameras(path))
     assert settings_of(TREE)["start"]["fov"] == 60
     with pytest.raises(CameraPathError):
         settings_of(TREE, look_at=((1.0,) * 3, (1.0,) * 3))
