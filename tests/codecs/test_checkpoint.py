@@ -18,11 +18,11 @@ import pytest
 from fixtures import by_hand_checkpoint
 from sparklod_cli.codecs import checkpoint
 from sparklod_cli.codecs.checkpoint import Tensor, unpickled
-from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
 from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import FormatError, NotSplatsError, TruncatedError
+from tests.codecs import cases
 from tests.codecs.cases import linear
 from tests.scenes import random_splats
 
@@ -30,8 +30,7 @@ SCENE = Scene(random_splats(50, sh_degree=1))
 
 
 def decode(data: bytes) -> Scene:
-    scene: Scene = decode_file(checkpoint, io.BytesIO(data))
-    return scene
+    return cases.decode(checkpoint, data)
 
 
 def with_pickle(data: bytes) -> bytes:
@@ -61,16 +60,9 @@ def test_nothing_is_called(protocol: int, capsys: pytest.CaptureFixture[str]) ->
 @pytest.mark.parametrize(
     "data",
     [
-        b"",
-        b"\x80\x02",
-        b".",
-        b"t.",
-        b"h\x01.",
-        b"\x85.",
-        b"X\xff\xff\xff\x7fabc.",
+        *(b"", b"\x80\x02", b".", b"t.", b"h\x01.", b"\x85.", b"X\xff\xff\xff\x7fabc.", b"cos\nsystem\nP1\n."),
         b"\x8e" + struct.pack("<Q", 1 << 62) + b"abc.",
         b"\x80\x02}(X\x01\0\0\0a",
-        b"cos\nsystem\nP1\n.",
     ],
 )
 def test_a_broken_pickle_is_an_error(data: bytes) -> None:
@@ -204,11 +196,9 @@ def test_two_checkpoints_in_a_zip_are_refused() -> None:
         )
         for count, folder in ((8, "a"), (16, "b/c"))
     )
-    for both in (zipped(one, other), zipped(other, one)):
+    for both in (zipped(one, other), zipped(other, one), zipped(one, one)):
         with pytest.raises(FormatError, match="its zip has 2 checkpoints; give each in a file of its own"):
             decode(both)
-    with pytest.raises(FormatError, match="its zip has 2 checkpoints"):
-        decode(zipped(one, one))
 
 
 def test_members_of_one_name_are_refused() -> None:
@@ -255,26 +245,23 @@ def test_sh_of_degree_4_is_cut_to_3(program: str) -> None:
     more = columns | {"sh": np.concatenate([columns["sh"], np.full((50, 9, 3), 7.0)], axis=1)}
     scene, whole = (decode(by_hand_checkpoint.checkpoint(**each, program=program)) for each in (more, columns))
     assert scene.notes == ("SH degree 4 is cut to 3",) and whole.notes == ()
-    for column in COLUMNS:
-        np.testing.assert_array_equal(getattr(scene.splats, column), getattr(whole.splats, column), err_msg=column)
+    cases.assert_same(scene.splats, whole.splats)
 
 
 def test_tensors_that_are_left_out_are_named() -> None:
     widths = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "features_dc": 3, "features_rest": 9, "normals": 3}
-    tensors = {f"_model.gauss_params.{name}": np.ones((9, width)) for name, width in widths.items()}
-    tensors |= {"_model.gauss_params.labels": np.ones(9), "_model.bil_grids.grids": np.ones((2, 4))}
-    tensors |= {"_model.appearance.0.weight": np.ones(2), "_model.appearance.0.bias": np.ones(2)}
-    tensors |= {"_model.lpips.net.slice1.weight": np.ones(2), "_model.device_indicator_param": np.ones(1)}
-    tensors |= {"_model.empty.grids": np.ones((0, 3))}
-    floats = {name: values.astype("<f4") for name, values in tensors.items()}
+    tensors = {f"gauss_params.{name}": np.ones((9, width)) for name, width in widths.items()}
+    tensors |= {"gauss_params.labels": np.ones(9), "bil_grids.grids": np.ones((2, 4)), "empty.grids": np.ones((0, 3))}
+    tensors |= dict.fromkeys(("appearance.0.weight", "appearance.0.bias", "lpips.net.slice1.weight"), np.ones(2))
+    floats = {f"_model.{name}": values.astype("<f4") for name, values in tensors.items()}
+    floats["_model.device_indicator_param"] = np.ones(1, "<f4")
     scene = decode(by_hand_checkpoint.saved(floats, under="pipeline", is_parameter=False))
     assert scene.notes == ("its tensors appearance, bil_grids and labels are left out",)
 
 
 def test_other_parts_of_a_checkpoint_of_gsplat_are_named() -> None:
-    names = ("means", "scales", "quats", "opacities", "sh0", "shN", "features")
-    widths = (3, 3, 4, 1, 3, 0, 32)
-    tensors = {name: np.ones((9, width), "<f4") for name, width in zip(names, widths, strict=True)}
+    widths = {"means": 3, "scales": 3, "quats": 4, "opacities": 1, "sh0": 3, "shN": 0, "features": 32}
+    tensors = {name: np.ones((9, width), "<f4") for name, width in widths.items()}
     other = by_hand_checkpoint.tensor("0", tensors["means"], is_parameter=False)
     more = b"".join(TEXT(key) + b"}(" + TEXT("embeds.weight") + other + b"u" for key in ("pose_adjust", "optimizers"))
     more += TEXT("exposure") + other
@@ -299,33 +286,27 @@ def test_nerfstudio_without_sh_has_logits_of_colours() -> None:
     np.testing.assert_allclose(splats.rgb, columns["rgb"], atol=1e-5)
 
 
+COLUMNS_OF = linear(SCENE)
+GSPLAT = {"means": "center", "scales": "scale", "quats": "quat_wxyz", "opacities": "opacity", "sh0": "rgb", "shN": "sh"}
+TENSORS = {name: np.ascontiguousarray(COLUMNS_OF[column], "<f4") for name, column in GSPLAT.items()}
+TENSORS["sh0"] = TENSORS["sh0"][:, None]
+FAR_APART = np.zeros((50, 4_000), "<f4")[:, :3]
+
+
 @pytest.mark.parametrize(
     ("tensors", "text"),
     [
-        ({"means": np.zeros((5, 3), "<f4")}, "its splats have no scales, quats, opacities, sh0, shN"),
+        ({"means": TENSORS["means"]}, "its splats have no scales, quats, opacities, sh0, shN"),
         ({}, "have no means"),
+        (TENSORS | {"scales": np.ones((49, 3), "<f4")}, "has the shape"),
+        (TENSORS | {"shN": np.zeros((50, 4, 3), "<f4")}, "has the shape"),
+        (TENSORS | {"quats": np.ones((50, 3), "<f4")}, "has the shape"),
+        (TENSORS | {"means": FAR_APART}, "means are not in order"),
     ],
 )
-def test_missing_tensors_are_named(tensors: dict[str, np.ndarray], text: str) -> None:
+def test_tensors_that_are_not_those_of_splats_are_refused(tensors: dict[str, np.ndarray], text: str) -> None:
     with pytest.raises(FormatError, match=text):
         decode(by_hand_checkpoint.saved(tensors, under="splats", is_parameter=False))
-
-
-def test_shapes_that_are_none_of_splats_are_refused() -> None:
-    columns = linear(SCENE)
-    for name, values in {"scale": np.ones((49, 3)), "sh": np.zeros((50, 4, 3)), "quat_wxyz": np.ones((50, 3))}.items():
-        with pytest.raises(FormatError, match="has the shape"):
-            decode(by_hand_checkpoint.checkpoint(**columns | {name: values}))
-
-
-def test_rows_that_are_far_apart_are_refused() -> None:
-    columns = linear(SCENE)
-    tensors = {"means": np.zeros((50, 4_000), "<f4")[:, :3]}
-    names = {"scales": "scale", "quats": "quat_wxyz", "opacities": "opacity", "shN": "sh"}
-    tensors |= {name: columns[column].astype("<f4") for name, column in names.items()}
-    tensors["sh0"] = columns["rgb"].astype("<f4")
-    with pytest.raises(FormatError, match="means are not in order"):
-        decode(by_hand_checkpoint.saved(tensors, under="splats", is_parameter=True))
 
 
 def test_numbers_of_sixteen_bits_are_read() -> None:

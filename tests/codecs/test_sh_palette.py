@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import pytest
 from sparklod_cli.codecs import sh_palette
 from sparklod_cli.codecs.kernels import sh_clustering
 from sparklod_cli.codecs.sh_palette import MAX_CODES, ShPalette, cluster, visible_weight
-from sparklod_cli.model.splats import Splats
+from tests.codecs.cases import splats_with
 from tests.references.sh_palettes import distances, halved, k_means, squared_error
 
 #: SH coefficients of degree 1 to 3.
@@ -65,13 +64,6 @@ def test_the_error_is_at_most_that_of_k_means_by_brute_force() -> None:
     ours = squared_error(flat(sh), flat(palette.codes), weight)
     for seed in range(2):
         assert ours < squared_error(flat(sh), k_means(flat(sh), 150, weight, 12, seed), weight)
-
-
-def test_few_codes_are_each_the_mean_of_the_rows_nearest_to_them() -> None:
-    sh = coefficients(3000, 3)
-    palette = cluster(sh, 12)  # no more than the neighbours that are looked at
-    labels = distances(flat(sh), flat(palette.codes)).argmin(axis=1)
-    assert np.array_equal(palette.labels, labels)
 
 
 def test_the_result_is_the_same_for_any_number_of_threads_and_in_every_run() -> None:
@@ -137,24 +129,25 @@ def test_coefficients_of_any_size_make_a_finite_palette(size: float) -> None:
     assert np.abs(palette.codes).max() <= np.abs(sh).max()
 
 
+ZEROS = np.zeros((5, 3, 3), np.float32)
+
+
 @pytest.mark.parametrize(
-    ("sh", "codes", "weight", "said"),
+    ("sh", "codes", "weight", "text"),
     [
-        (np.zeros((5, 0, 3), np.float32), 4, None, r"shape \(5, 0, 3\)"),
-        (np.zeros((5, 9), np.float32), 4, None, r"shape \(5, 9\)"),
-        (np.zeros((5, 3, 3), np.float32), 0, None, "codes is 0"),
-        (np.zeros((5, 3, 3), np.float32), MAX_CODES + 1, None, "codes is 65537"),
-        (np.full((5, 3, 3), np.nan, np.float32), 4, None, "NaN"),
-        (np.full((5, 3, 3), -np.inf, np.float32), 4, None, "infinity"),
-        (np.zeros((5, 3, 3), np.float32), 4, np.ones(4), r"weight has the shape \(4,\)"),
-        (np.zeros((5, 3, 3), np.float32), 4, np.array([1, 1, 1, 1, -1.0]), "below 0"),
-        (np.zeros((5, 3, 3), np.float32), 4, np.array([1, 1, 1, 1, np.inf]), "infinity"),
+        (ZEROS[:, :0], 4, None, r"shape \(5, 0, 3\)"),
+        (ZEROS.reshape(5, 9), 4, None, r"shape \(5, 9\)"),
+        (ZEROS, 0, None, "codes is 0"),
+        (ZEROS, MAX_CODES + 1, None, "codes is 65537"),
+        (ZEROS + np.float32(np.nan), 4, None, "NaN"),
+        (ZEROS - np.float32(np.inf), 4, None, "infinity"),
+        (ZEROS, 4, np.ones(4), r"weight has the shape \(4,\)"),
+        (ZEROS, 4, np.array([1, 1, 1, 1, -1.0]), "below 0"),
+        (ZEROS, 4, np.array([1, 1, 1, 1, np.inf]), "infinity"),
     ],
 )
-def test_arguments_out_of_their_range_are_refused(
-    sh: np.ndarray, codes: int, weight: np.ndarray | None, said: str
-) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_arguments_out_of_their_range_are_refused(sh: Any, codes: int, weight: Any, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
         cluster(sh, codes, weight=weight)
 
 
@@ -169,22 +162,9 @@ def test_progress_comes_to_its_end() -> None:
 
 
 def test_a_splat_weighs_as_its_two_longest_axes_and_its_opacity_say() -> None:
-    count = 4
-    splats = Splats(
-        center=np.zeros((count, 3), np.float32),
-        scale=np.array([[2, 3, 1], [2, 1, 3], [4, 6, 2], [2, 3, 1]], np.float32),
-        quat_xyzw=np.tile(np.array([0, 0, 0, 1], np.float32), (count, 1)),
-        opacity=np.array([0.5, 0.5, 0.5, 0], np.float32),
-        rgb=np.zeros((count, 3), np.float32),
-        sh=np.zeros((count, 0, 3), np.float32),
-    )
+    splats = splats_with(4, scale=[[2, 3, 1], [2, 1, 3], [4, 6, 2], [2, 3, 1]], opacity=[0.5, 0.5, 0.5, 0])
     expected = np.array([3, 3, 12, 0]) ** sh_palette.AREA_POWER
     assert visible_weight(splats) == pytest.approx(expected)
-
-
-def test_importing_the_module_does_not_load_numba() -> None:
-    code = "import sys; import sparklod_cli.codecs.sh_palette; print('numba' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
 
 
 def test_a_cell_is_cut_across_its_principal_axis() -> None:
@@ -254,11 +234,3 @@ def test_pruning_by_distance_changes_no_label() -> None:
         found.append((labels, errors))
     assert np.array_equal(found[0][0], found[1][0])
     assert found[0][1] == pytest.approx(((rows - codes[found[0][0]]) ** 2).sum(axis=1), rel=1e-4, abs=1e-6)
-
-
-def test_a_code_without_rows_takes_the_row_that_is_farthest_from_its_own() -> None:
-    rows = np.array([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]], np.float32)
-    clustering = sh_palette._Clustering(rows, np.arange(3, dtype=np.uint32), np.ones(3), sh_palette.silent)
-    labels = np.zeros(3, np.int32)
-    clustering._refill(np.array([1, 2]), labels, np.array([0, 1, 81], np.float32))
-    assert labels.tolist() == [0, 2, 1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
 from types import ModuleType
 
@@ -16,7 +15,6 @@ from hypothesis.extra import numpy as arrays
 from sparklod_cli.codecs import quantize, spz, statistics
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
-from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.statistics import (
     ALL,
     EXACT_BITS,
@@ -34,11 +32,11 @@ from sparklod_cli.codecs.statistics import (
     tops,
 )
 from sparklod_cli.lod import quick
-from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.transforms import sh_basis
 from sparklod_cli.system.errors import FormatError
+from tests.codecs.cases import decode, encode, splats_with, star
 from tests.scenes import random_splats
 
 
@@ -49,19 +47,14 @@ def tree_of(count: int, sh_degree: int) -> Scene:
     splats.scale[:] *= np.exp(rng.normal(0, 2, size=(count, 1)))
     splats.rgb[rng.random(count) < 0.01] *= -3
     splats.sh[rng.random(count) < 0.02] *= 9
-    children, start = np.zeros(count, np.uint16), np.zeros(count, np.uint32)
-    children[0], start[0] = count - 1, 1
-    return Scene(splats, LodTree(children, start))
+    return Scene(splats, star(count))
 
 
 def pieces_of(scene: Scene, cuts: list[int], needed: frozenset[str] = ALL) -> list[Statistics]:
     """Statistics of the pieces between these places."""
-    leaf = None if scene.tree is None else scene.tree.is_leaf
-    found = []
-    for start, stop in zip([0, *cuts], [*cuts, len(scene)], strict=True):
-        part = scene.splats.take(slice(start, stop))
-        found.append(Statistics.of(part, None if leaf is None else leaf[start:stop], needed))
-    return found
+    leaf = np.ones(len(scene), bool) if scene.tree is None else scene.tree.is_leaf
+    parts = [slice(start, stop) for start, stop in zip([0, *cuts], [*cuts, len(scene)], strict=True)]
+    return [Statistics.of(scene.splats.take(part), leaf[part] if scene.tree else None, needed) for part in parts]
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
@@ -106,11 +99,10 @@ def test_an_array_holds_all_of_them() -> None:
     for name, value in vars(found).items():
         if name not in ("values", "leaf_sh"):
             assert getattr(back, name) == value
-    pairs = [(values, back.values[name]) for name, values in found.values.items()]
     np.testing.assert_array_equal(found.leaf_sh, back.leaf_sh)
-    for one, other in pairs:
-        for key, value in vars(one).items():
-            np.testing.assert_array_equal(getattr(other, key), value)
+    for name, values in found.values.items():
+        for key, value in vars(values).items():
+            np.testing.assert_array_equal(getattr(back.values[name], key), value)
     few = Statistics.from_array(Statistics.of_scene(scene, {"reach"}).array())
     assert few.reach == float(np.abs(scene.splats.center).max()) and not few.values and few.leaf_sh is None
 
@@ -125,20 +117,14 @@ def test_only_what_is_needed_is_counted() -> None:
 
 
 def test_statistics_refuse_what_the_scene_refuses() -> None:
-    far = random_splats(5)
-    far.center[2, 1] = -1e7
+    far = splats_with(5, center=-1e7)
     with pytest.raises(FormatError, match=r"coordinates reach 1e\+07"):
         spz.settled(Statistics.merged(pieces_of(Scene(far), [2, 4], spz.needed(DEFAULTS))), DEFAULTS)
-    many = Statistics(1 << 32, 0, True)
     options = rad.settled(Scene(random_splats(1)), DEFAULTS)
     with pytest.raises(FormatError, match="4,294,967,296 splats; RAD numbers at most 4,294,967,295"):
-        rad.settled(many, options)
-
-
-def test_pieces_of_different_scenes_are_refused() -> None:
-    parts = [Statistics.of(random_splats(3, sh_degree=degree)) for degree in (0, 1)]
+        rad.settled(Statistics(1 << 32, 0, True), options)
     with pytest.raises(ValueError, match="cannot be merged"):
-        Statistics.merged(parts)
+        Statistics.merged([Statistics.of(random_splats(3, sh_degree=degree)) for degree in (0, 1)])
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -166,13 +152,6 @@ def test_signs_and_ends_are_kept_apart() -> None:
     assert tops(negative, 9, 2.5, np.array([0.0])) == [2.5]
 
 
-def test_no_values_have_no_ends() -> None:
-    found = Distribution.of(np.empty((0, 3), np.float32))
-    assert (found.count, found.lowest, found.highest) == (0, 0, 0)
-    assert found.quantile(0.5) == 0
-    assert tops(found.magnitudes(1), 1, 0, np.array([0.0, 0.5])).tolist() == [0, 0]
-
-
 def bits_of(values: np.ndarray) -> int:
     """Fractional bits by the quantile itself."""
     small = float(np.quantile(values.astype(np.float64), SMALL_QUANTILE)) if len(values) else 0.0
@@ -191,9 +170,8 @@ def test_bits_are_those_of_the_quantile(seed: int) -> None:
 
 def test_a_quantile_between_two_bins_is_exact() -> None:
     values = np.array([1.5, 1.75, 200, 300], np.float32)
-    found = Distribution.of(values)
     for share in (0, 0.2, 0.5, 1):
-        assert found.quantile(share) == np.quantile(values, share)
+        assert Distribution.of(values).quantile(share) == np.quantile(values, share)
     assert Distribution.of(np.array([1, -np.nan], np.float32)).quantile(0) == math.inf
 
 
@@ -225,7 +203,11 @@ def test_powers_of_two_and_the_ends_of_float32_have_their_own_binade(small: floa
 
 @pytest.mark.parametrize("values", [[], [0, 0, 5], [1, math.nan], [math.inf, math.inf]])
 def test_without_a_size_nothing_is_rounded(values: list[float]) -> None:
-    assert fine_bits(Distribution.of(np.array(values, np.float32))) == EXACT_BITS
+    found = Distribution.of(np.array(values, np.float32))
+    assert fine_bits(found) == EXACT_BITS
+    if not values:
+        assert (found.count, found.lowest, found.highest, found.quantile(0.5)) == (0, 0, 0, 0)
+        assert tops(found.magnitudes(1), 1, 0, np.array([0.0, 0.5])).tolist() == [0, 0]
 
 
 def sh_of(degree: int, spread: float, count: int = 400, seed: int = 0) -> np.ndarray:
@@ -269,19 +251,10 @@ def test_codes_keep_the_bits_that_they_have(bits: int, degree: int, seed: int) -
 def test_leaves_decide_and_merged_splats_keep_the_fewest() -> None:
     splats = random_splats(500, sh_degree=3, seed=5)
     nodes, tree = quick.build(splats)
-    scene = Scene(dataclasses.replace(nodes), tree)
+    scene = Scene(nodes, tree)
     bits = spz.settled(scene, DEFAULTS).sh_bits
     assert bits is not None and bits > 4
     assert bits == spz.settled(Scene(splats), DEFAULTS).sh_bits
-    back = decode_file(spz, io.BytesIO(b"".join(spz.encode(scene)))).splats.sh
+    back = decode(spz, encode(spz, scene)).splats.sh
     for rows, kept in ((tree.is_leaf, bits), (~tree.is_leaf, 4)):
         np.testing.assert_array_equal(back[rows], quantize.decode_sh(quantize.encode_sh(nodes.sh[rows], kept)))
-
-
-def test_bits_may_be_given() -> None:
-    scene = Scene(random_splats(50, sh_degree=2))
-    for bits in range(4, 9):
-        back = decode_file(spz, io.BytesIO(b"".join(spz.encode(scene, WriteOptions(sh_bits=bits))))).splats.sh
-        assert math.log2(np.abs(back - scene.splats.sh).max()) < -bits
-    with pytest.raises(ValueError, match="sh_bits is 3, not 4 to 8"):
-        spz.settled(scene, WriteOptions(sh_bits=3))

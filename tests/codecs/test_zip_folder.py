@@ -14,10 +14,9 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.streamed_manifest import parse
 from sparklod_cli.codecs.zip_folder import ZipFolder
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
-from sparklod_cli.model.scene import Scene
-from sparklod_cli.model.splats import COLUMNS
 from sparklod_cli.system.errors import FormatError, NotSplatsError
 from sparklod_cli.viewers.playcanvas import read_detail_files
+from tests.codecs.cases import assert_same
 from tests.conftest import FIXTURES, Capture
 
 GOLDEN = FIXTURES / "golden"
@@ -35,10 +34,10 @@ def zipped(path: Path, files: dict[str, bytes], *, method: int = zipfile.ZIP_STO
     return path
 
 
-def assert_same(found: Scene, expected: Scene) -> None:
-    assert (found.format, len(found.splats)) == (expected.format, len(expected.splats))
-    for column in COLUMNS:
-        np.testing.assert_array_equal(getattr(found.splats, column), getattr(expected.splats, column), column)
+def assert_holds(path: Path, kind: str, **how: int) -> None:
+    found, expected = read_scene(path, **how), read_scene(SETS[kind])
+    assert found.format == expected.format
+    assert_same(found.splats, expected.splats)
 
 
 WAYS: dict[str, Callable[[dict[str, bytes]], dict[str, bytes]]] = {
@@ -57,15 +56,14 @@ def test_a_zip_is_read_as_its_folder(kind: str, way: str, tmp_path: Path) -> Non
     for method in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         path = zipped(tmp_path / "scene.ssog", WAYS[way](files_in(SETS[kind])), method=method)
         for threads in (1, 3):
-            assert_same(read_scene(path, threads=threads), read_scene(SETS[kind]))
+            assert_holds(path, kind, threads=threads)
 
 
 @pytest.mark.parametrize("kind", ["sh1-streamed-sog", "sh1-tiles"])
 def test_a_zip_has_the_levels_and_sizes_of_its_folder(kind: str, tmp_path: Path) -> None:
     path = zipped(tmp_path / "scene.zip", files_in(SETS[kind]))
     found, expected = read_parts(path), read_parts(SETS[kind])
-    assert found is not None
-    assert expected is not None
+    assert found is not None and expected is not None
     np.testing.assert_array_equal(found.splats.center, expected.splats.center)
     np.testing.assert_array_equal(found.counts, expected.counts)
     if kind == "sh1-streamed-sog":
@@ -86,7 +84,7 @@ def test_bundles_in_a_zip_are_read(tmp_path: Path) -> None:
         manifest = manifest.replace(f"{folder}/meta.json".encode(), f"{folder}.sog".encode())
     (tmp_path / "flat" / "lod-meta.json").write_bytes(manifest)
     path = zipped(tmp_path / "scene.ssog", files_in(tmp_path / "flat"))
-    assert_same(read_scene(path), read_scene(SETS["sh1-streamed-sog"]))
+    assert_holds(path, "sh1-streamed-sog")
     sizes = read_detail_files(tmp_path / "flat").sizes.tolist()
     assert sizes == read_detail_files(path).sizes.tolist()
     assert sizes == [(tmp_path / "flat" / name).stat().st_size for name in parse(manifest).names()]
@@ -166,4 +164,4 @@ def test_a_folder_of_several_scenes_is_refused_by_name(others: tuple[str, ...], 
         (tmp_path / name).write_bytes(data)
     with pytest.raises(FormatError, match=f"a directory with lod-meta.json and {others[0]}.*; give one of them"):
         read_scene(tmp_path)
-    assert_same(read_scene(tmp_path / "lod-meta.json"), read_scene(SETS["sh1-streamed-sog"]))
+    assert_holds(tmp_path / "lod-meta.json", "sh1-streamed-sog")
