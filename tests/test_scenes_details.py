@@ -21,8 +21,8 @@ from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import PLAYCANVAS_BUDGET, DetailRule, LodSettings
 from tests.conftest import FIXTURES
 from tests.lod.details import row_of_regions
+from tests.part_files import write_streamed
 from tests.scenes import random_splats
-from tests.streamed import write_streamed
 
 #: Six regions along z, seen from before the first one: 64, 32 and 16 splats each.
 AT = Camera.look_at([0, 0, -6], [0, 0, 0], size=(64, 48))

@@ -8,7 +8,7 @@ import pytest
 
 import sparklod_cli as sparklod
 from tests.lod.details import row_of_regions
-from tests.streamed import write_streamed
+from tests.part_files import write_streamed
 
 AT = sparklod.Camera.look_at([0, 0, -6], [0, 0, 0], size=(48, 32))
 FULL = 6 * 64 + 5

@@ -25,8 +25,8 @@ from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.system.errors import FormatError, NotSplatsError, PromiseError, UnsupportedError, VersionError
 from tests.codecs.cases import linear
-from tests.codecs.streamed_sog.scenes import open_companion
 from tests.codecs.test_glb import with_root
+from tests.part_files import open_companion
 from tests.scenes import random_splats
 
 SH2, SH0 = random_splats(40, sh_degree=2), random_splats(30, seed=2)

@@ -44,7 +44,7 @@ from tests.codecs.cases import (
     rounding,
     stated_degrees,
 )
-from tests.codecs.rad.ways import RAD
+from tests.codecs.rad_cases import RAD
 
 # --- PLY --------------------------------------------------------------------------------------------------------------
 

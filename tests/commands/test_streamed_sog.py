@@ -12,7 +12,7 @@ import pytest
 from sparklod_cli.cli import run
 from tests.conftest import FIXTURES, Capture
 from tests.lod.details import row_of_regions
-from tests.streamed import write_streamed
+from tests.part_files import write_streamed
 
 AT = ("--look-at", "0,0,-6:0,0,0", "--size", "48x32")
 TREE = FIXTURES / "golden" / "hand-tree-v3.spz"

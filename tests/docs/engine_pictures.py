@@ -23,7 +23,7 @@ from tests.conftest import FIXTURES, ROOT
 from tests.interop.engines import recipes
 from tests.interop.engines.browser import Browser, Shown
 from tests.interop.engines.conftest import detailed, sky, written
-from tests.tiled import tiled
+from tests.part_files import tiled
 
 FOLDER = ROOT / "docs" / "images" / "engines"
 

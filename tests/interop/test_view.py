@@ -40,9 +40,9 @@ from tests.interop.engines.conftest import engines_dir as engines_dir
 from tests.interop.engines.likeness import like_cesium
 from tests.interop.node import Node
 from tests.interop.pictures import psnr
+from tests.part_files import tiled
 from tests.scenes import random_splats
 from tests.signals import heed_signals
-from tests.tiled import tiled
 
 pytestmark = pytest.mark.slow
 

@@ -20,8 +20,8 @@ from sparklod_cli.viewers.playcanvas import LoadedDetail
 from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import DetailRule, LodSettings, Network, StreamingSettings
 from tests.lod.details import row_of_regions
+from tests.part_files import write_streamed
 from tests.simulation.test_loading import cut_after
-from tests.streamed import write_streamed
 
 CUT = LodSettings(200)
 SLOW = StreamingSettings(Network(20_000, 0.1))

@@ -17,8 +17,8 @@ from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.view.server import Server
 from sparklod_cli.view.site import FILES, LICENSES, MODULES, VERSIONS, Site
 from tests.conftest import FIXTURES
+from tests.part_files import tiled
 from tests.scenes import random_splats
-from tests.tiled import tiled
 
 TREE = FIXTURES / "golden" / "tree-v3.spz"
 CHUNKED = FIXTURES / "golden" / "sh3-rad" / "sh3.rad"

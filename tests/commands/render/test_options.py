@@ -24,9 +24,8 @@ from sparklod_cli.render.rasterizer import Image, ShadedSplats
 from sparklod_cli.render.settings import RasterSettings
 from tests.conftest import FIXTURES, Capture
 from tests.lod.details import row_of_regions
+from tests.part_files import tiled, write_streamed
 from tests.scenes import random_splats
-from tests.streamed import write_streamed
-from tests.tiled import tiled
 
 pytestmark = pytest.mark.slow
 

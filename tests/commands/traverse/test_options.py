@@ -18,9 +18,8 @@ from sparklod_cli.model.scene import Scene
 from tests.commands.render.test_options import GIVEN as OF_RENDER
 from tests.conftest import FIXTURES, Capture
 from tests.lod.details import row_of_regions
+from tests.part_files import tiled, write_streamed
 from tests.scenes import random_splats
-from tests.streamed import write_streamed
-from tests.tiled import tiled
 
 CAMERAS = FIXTURES / "cameras"
 

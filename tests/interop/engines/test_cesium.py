@@ -27,7 +27,7 @@ from tests.interop.engines.browser import Browser, Shown
 from tests.interop.engines.conftest import SIZE
 from tests.interop.engines.likeness import like_cesium, likeness
 from tests.interop.pictures import cameras_around
-from tests.tiled import tiled
+from tests.part_files import tiled
 
 pytestmark = pytest.mark.slow
 

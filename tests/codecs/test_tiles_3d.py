@@ -1,4 +1,4 @@
-"""3D Tiles as they are written and read: rounding, axes, nested tilesets, other writers' tiles, and what is refused."""
+"""3D Tiles: reading, writing, axes, nested tilesets, and tilesets that are refused."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from fixtures import by_hand_glb, by_hand_tiles
-from sparklod_cli.codecs import tiles_3d as codec
+from sparklod_cli.codecs import tiles_3d
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
-from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.tileset import LARGEST
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.lod import quality
@@ -25,10 +24,10 @@ from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import AXES, Scene, TileScene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
-from sparklod_cli.system.errors import FormatError, VersionError
-from tests.codecs.cases import linear
-from tests.codecs.streamed_sog.scenes import open_companion
+from sparklod_cli.system.errors import FormatError
+from tests.codecs.cases import decode, linear
 from tests.conftest import FIXTURES
+from tests.part_files import open_companion
 from tests.scenes import random_splats
 
 GOLDEN = FIXTURES / "golden" / "sh1-tiles"
@@ -38,36 +37,32 @@ Files = dict[str, bytes]
 @functools.cache
 def tiles(up: str | None = None) -> TileScene:
     """Three levels of tiles."""
-    made = make_tiles(
-        *quality.build(random_splats(1_500, sh_degree=1), 2.0), TileSettings(tile_splats=100, lat=47, lon=8)
-    )
-    return dataclasses.replace(made, up=up)
+    settings = TileSettings(tile_splats=100, lat=47, lon=8)
+    return dataclasses.replace(make_tiles(*quality.build(random_splats(1_500, sh_degree=1), 2.0), settings), up=up)
 
 
 def files_of(scene: TileScene, profile: str | None = None, **more: Any) -> Files:
-    files = codec.encode_files(scene, WriteOptions(glb_profile=profile), **more)
+    files = tiles_3d.encode_files(scene, WriteOptions(glb_profile=profile), **more)
     return {name: b"".join(pieces) for name, pieces in files}
 
 
 def scene_of(files: Files) -> Scene:
-    scene = decode_file(codec, io.BytesIO(files["tileset.json"]), open_companion=open_companion(files))
-    assert isinstance(scene, Scene)
-    return scene
+    return decode(tiles_3d, files["tileset.json"], open_companion=open_companion(files))
 
 
 def tiles_of(files: Files) -> TileScene:
-    return codec.decode_parts(io.BytesIO(files["tileset.json"]), open_companion=open_companion(files))
+    return tiles_3d.decode_parts(io.BytesIO(files["tileset.json"]), open_companion=open_companion(files))
 
 
-def two_tiles(**more: Any) -> Files:
-    """A root and a tile, written by hand."""
+def two_tiles() -> Files:
+    """A root and a tile, of the writers in `fixtures`."""
     splats = linear(Scene(random_splats(20, sh_degree=0)))
-    tile = by_hand_tiles.Tile(splats)
-    return by_hand_tiles.tileset_files(by_hand_tiles.Tile(splats, [tile]), by_hand_glb.glb, **more)
+    root = by_hand_tiles.Tile(splats, [by_hand_tiles.Tile(splats)])
+    return by_hand_tiles.tileset_files(root, by_hand_glb.glb)
 
 
-def changed(change: Callable[[Any], object], files: Files | None = None) -> Files:
-    files = two_tiles() if files is None else files
+def changed(change: Callable[[Any], object]) -> Files:
+    files = two_tiles()
     root = json.loads(files["tileset.json"])
     change(root)
     return files | {"tileset.json": json.dumps(root).encode()}
@@ -86,7 +81,7 @@ def assert_close(one: Splats, other: Splats, rtol: float, atol: float) -> None:
 
 
 @pytest.mark.parametrize("up", [None, *AXES])
-def test_plain_tiles_are_read_as_they_were(up: str | None) -> None:
+def test_plain_tiles_round_trip(up: str | None) -> None:
     scene, files = tiles(up), files_of(tiles(up), "khronos")
     back = tiles_of(files)
     assert_close(back.splats, scene.splats, 1e-5, 1e-6)
@@ -98,25 +93,26 @@ def test_plain_tiles_are_read_as_they_were(up: str | None) -> None:
     full = scene_of(files)
     assert_close(full.splats, scene.scene().splats, 1e-5, 1e-6)
     assert (full.up, full.format) == (up, "3D Tiles 1.1 of GLB")
-    assert full.notes == (codec.NOT_PLACED,)
+    assert full.notes == (tiles_3d.NOT_PLACED,)
 
 
-def test_full_detail_is_that_of_the_tree_within_the_rounding_of_spz() -> None:
-    scene = tiles()
-    back = scene_of(files_of(scene))
+def test_tiles_with_spz_round_trip_within_its_rounding_and_threads_change_no_byte() -> None:
+    expected, files = tiles().scene().splats, files_of(tiles())
+    back = scene_of(files)
     assert back.format == "3D Tiles 1.1 of GLB SPZ 3"
-    np.testing.assert_allclose(back.splats.center, scene.scene().splats.center, atol=1e-3)
-    np.testing.assert_allclose(np.log(back.splats.scale), np.log(scene.scene().splats.scale), atol=1 / 32 + 1e-5)
-    np.testing.assert_allclose(back.splats.opacity, scene.scene().splats.opacity, atol=0.05)
+    np.testing.assert_allclose(back.splats.center, expected.center, atol=1e-3)
+    np.testing.assert_allclose(np.log(back.splats.scale), np.log(expected.scale), atol=1 / 32 + 1e-5)
+    np.testing.assert_allclose(back.splats.opacity, expected.opacity, atol=0.05)
+    assert files_of(tiles(), threads=4) == files
 
 
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("up", [None, *AXES])
-def test_what_a_viewer_loads_lies_in_the_boxes(up: str | None, profile: str) -> None:
-    """A viewer applies the matrix of the node, and turns y up to z up; and up is up."""
+def test_tiles_are_upright_and_inside_their_boxes_in_a_viewer(up: str | None, profile: str) -> None:
+    """A viewer applies the matrix of the node, and turns y up to z up."""
     files = files_of(tiles(up), profile)
 
-    def look(tile: dict[str, Any]) -> None:
+    def check(tile: dict[str, Any]) -> None:
         data = files[tile["content"]["uri"]]
         gltf = json.loads(data[20 : 20 + struct.unpack_from("<I", data, 12)[0]])
         node = gltf["nodes"][0]
@@ -134,12 +130,12 @@ def test_what_a_viewer_loads_lies_in_the_boxes(up: str | None, profile: str) -> 
         half = np.abs(box[3:].reshape(3, 3)).sum(axis=0)
         assert (ends.min(axis=0) >= box[:3] - half - 1e-6).all() and (ends.max(axis=0) <= box[:3] + half + 1e-6).all()
         for below in tile.get("children", []):
-            look(below)
+            check(below)
 
-    look(json.loads(files["tileset.json"])["root"])
+    check(json.loads(files["tileset.json"])["root"])
 
 
-def test_the_head_is_what_viewers_know_splats_by() -> None:
+def test_the_tileset_names_the_extensions_by_which_viewers_recognise_splats() -> None:
     head = json.loads(files_of(tiles())["tileset.json"])
     names = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
     assert head["extensions"]["3DTILES_content_gltf"] == {"extensionsUsed": names, "extensionsRequired": names}
@@ -149,11 +145,7 @@ def test_the_head_is_what_viewers_know_splats_by() -> None:
     assert len(head["root"]["transform"]) == 16
 
 
-def test_the_bytes_are_the_same_for_any_number_of_threads() -> None:
-    assert files_of(tiles(), threads=4) == files_of(tiles(), threads=1)
-
-
-def test_subtrees_of_many_tiles_are_nested_tilesets() -> None:
+def test_large_subtrees_are_nested_tilesets() -> None:
     made = make_tiles(*quality.build(random_splats(3_000, sh_degree=0), 2.0), TileSettings(tile_splats=20))
     whole, nested = files_of(made, "khronos"), files_of(made, "khronos", most_tiles=60)
     inner = [name for name in nested if name.startswith("tiles/") and name.endswith(".json")]
@@ -167,7 +159,7 @@ def test_subtrees_of_many_tiles_are_nested_tilesets() -> None:
 
 
 @pytest.mark.parametrize("corner", [3.3e38, 3.41e38, np.inf])
-def test_what_is_written_has_boxes_that_the_check_takes(corner: float) -> None:
+def test_bounds_beyond_float32_are_refused(corner: float) -> None:
     bounds = tiles().bounds.copy()
     bounds[0, 1] = corner
     scene = dataclasses.replace(tiles(), bounds=bounds)
@@ -192,7 +184,7 @@ def test_the_golden_file_is_read() -> None:
     assert read_parts(FIXTURES / "sh1.ply") is None
 
 
-def test_transforms_of_tiles_are_applied_but_for_that_of_the_root() -> None:
+def test_transforms_are_applied_except_that_of_the_root() -> None:
     # A quarter turn about z, twice the size, and up by 5, in the axes of the tileset.
     matrix = [0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 0, 0, 5, 1]
     files = child(transform=matrix)
@@ -233,6 +225,10 @@ LARGE = [1e12, 0, 0, 0, 0, 1e12, 0, 0, 0, 0, 1e12, 0, 0, 0, 0, 1]
         (child(transform=[1, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), "stretches, shears or mirrors"),
         (child(content={"uri": "tileset.json"}), "names the tileset 'tileset.json' twice"),
         (child(content={"uri": "other.json"}), "there is no 'other.json'"),
+        (
+            changed(lambda each: each["asset"].update(version="2.0")),
+            r"version '2\.0' is unknown, only 1\.0 and 1\.1 are",
+        ),
         (changed(lambda each: each.update(extensionsRequired=["X_y"])), "requires the extension 'X_y'"),
         (changed(lambda each: each.pop("root")), "root of tileset.json: expected an object, but it is missing"),
         (changed(lambda each: each.pop("asset")), "asset of tileset.json: expected an object, but it is missing"),
@@ -240,14 +236,9 @@ LARGE = [1e12, 0, 0, 0, 0, 1e12, 0, 0, 0, 0, 1e12, 0, 0, 0, 0, 1]
     ],
 )
 @pytest.mark.filterwarnings("error")
-def test_what_is_not_read_is_refused_by_name(files: Files, match: str) -> None:
+def test_unsupported_and_broken_tilesets_are_refused(files: Files, match: str) -> None:
     with pytest.raises(FormatError, match=match):
         scene_of(files)
-
-
-def test_another_version_is_refused() -> None:
-    with pytest.raises(VersionError, match=r"version '2\.0' is unknown, only 1\.0 and 1\.1 are read"):
-        scene_of(changed(lambda tileset: tileset["asset"].update(version="2.0")))
 
 
 def test_nested_tilesets_in_a_circle_are_refused() -> None:
@@ -269,7 +260,7 @@ def test_nested_tilesets_in_a_circle_are_refused() -> None:
         (None, "none of box, sphere and region"),
     ],
 )
-def test_tiles_need_boxes_or_spheres_and_full_detail_does_not(volume: Any, match: str) -> None:
+def test_a_wrong_bounding_volume_is_refused_by_readers_of_tiles(volume: Any, match: str) -> None:
     files = child(boundingVolume=volume)
     assert len(scene_of(files)) == 20
     with pytest.raises(FormatError, match=match):
