@@ -18,7 +18,7 @@ from ..system.errors import SparklodError
 from ..system.stdio import DASH, name_of
 from ..system.units import format_size, percent_of
 from ..system.untrusted import MOST, shortened
-from .command import COMMON, Command, check_declared, is_set, refuse, values_of
+from .command import COMMON, Command, values_of
 from .console import Console, count_of, print_json, say
 from .options.baking import (
     CLUSTER,
@@ -26,7 +26,6 @@ from .options.baking import (
     FILE_FORMAT,
     LARGE,
     MANIFESTS,
-    OF_CLUSTERS,
     POSITION,
     REFINING,
     SELECTION,
@@ -34,9 +33,9 @@ from .options.baking import (
     TREE,
     TREES,
     BuildLodOptions,
-    refuse_others,
 )
 from .paths import NAMELESS, Folder, claim_stdout, is_same_place, keep_apart, require_suffix, with_chunks
+from .rules import check, is_set
 
 if TYPE_CHECKING:
     from ..api.bake_jobs import Outcome, Pair
@@ -74,8 +73,6 @@ EXAMPLES = """\
 #: Suffixes of formats that hold no tree, and how else their names end.
 PLAIN = {ending for form in FORMATS for ending in (*form.suffixes, *form.endings) if not form.trees}
 
-BOTH = "--output cannot be used with --output-dir"
-
 HEADINGS = (COMMON, TREE, SELECTION, POSITION, FILE_FORMAT, "RAD", DETAIL, TILED, REFINING, LARGE, CLUSTER)
 
 
@@ -109,8 +106,6 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     """
     output = ctx.params["output"]
     if isinstance(output, Folder):  # an --output that names a folder is an --output-dir
-        if ctx.params["output_dir"] is not None:
-            raise click.UsageError(BOTH)
         ctx.params.update(output=None, output_dir=output.path)
     options = values_of(ctx, BuildLodOptions)
     general = options.general
@@ -169,22 +164,16 @@ def _check(ctx: click.Context, options: BuildLodOptions) -> list[Instance]:
     """Return the instances of --scene; raise a `click.UsageError` where options or names of files contradict."""
     if not options.inputs and options.scene is None:
         raise click.MissingParameter(ctx=ctx, param=next(each for each in ctx.command.params if each.name == "inputs"))
-    if options.inputs and options.scene is not None:
-        raise click.UsageError("INPUT cannot be used with --scene, which names the files")
-    inputs, output, form, merging = options.inputs, options.output, options.output_form, ""
-    if options.merge or options.scene is not None:
-        merging = "--merge" if options.merge else "--scene"
-        refuse(ctx, ("output_dir", "rgba"), f"cannot be used with {merging}")
-        if output is None:
-            raise click.UsageError(f"{merging} makes one file of all inputs; name it with --output")
+    inputs, output, form = options.inputs, options.output, options.output_form
+    merges = options.merge or options.scene is not None
+    place = "standard output" if output == DASH else "file" if output is not None else "folder"
+    check(ctx, place=place, source="standard input" if DASH in inputs else "files", count=len(inputs))
     instances: list[Instance] = []
     if options.scene is not None:
         from ..viewers.instances_file import read_instances
 
         instances = read_instances(options.scene)
     if output is not None:
-        if options.output_dir is not None:
-            raise click.UsageError(BOTH)
         if len(inputs) > 1 and not options.merge:
             raise click.UsageError(
                 f"--output takes one input, not {len(inputs)}; add --merge to bake them as one scene, or name a folder"
@@ -198,7 +187,7 @@ def _check(ctx: click.Context, options: BuildLodOptions) -> list[Instance]:
                     f"nothing can be written beside {source}; name the output with -o or --output-dir"
                 )
     targets = [output] if output is not None else [options.target(source) for source in inputs]
-    refines = options.refine is not None and not options.skip_existing and not merging
+    refines = options.refine is not None and not options.skip_existing and not merges
     if refines and options.overwrite:  # a tree may replace itself, for its leaves and links stay
         targets = [target for source, target in zip(inputs, targets, strict=True) if not is_same_place(source, target)]
     unbundled = form.suffix in WRITABLE and form.suffix == WRITABLE[form.suffix].unbundled
@@ -207,24 +196,12 @@ def _check(ctx: click.Context, options: BuildLodOptions) -> list[Instance]:
     named = [instance.file for instance in instances if instance.file is not None]
     keep_apart(ctx, {"output" if options.output_dir is None else "output_dir": targets, "scene": named})
     claim_stdout(ctx, "output", as_json=options.as_json, binary=True)
-    if options.input_scene.rgba is not None and len(inputs) > 1:
-        raise click.UsageError(f"--rgba takes one input, not {len(inputs)}")
-    if options.skip_existing and output == DASH:
-        raise click.UsageError("--skip-existing needs an output that can be there already; name a file")
-    check_formats(ctx, options)
-    check_declared(ctx)
-    if is_set(ctx, "scheduler"):
-        refuse(ctx, ["workers"], "cannot be used with --scheduler, whose workers run already")
-    if is_set(ctx, "refine"):
-        refuse(ctx, ["scratch_dir", "resume"], "cannot be used with --refine, which needs the whole tree in memory")
-    if DASH in inputs:
-        refuse(
-            ctx, OF_CLUSTERS, "cannot be used with standard input, which workers cannot read; save it to a file first"
-        )
+    check_formats(options)
+    check(ctx, format=options.format, method=options.builder)
     return instances
 
 
-def check_formats(ctx: click.Context, options: BuildLodOptions) -> None:
+def check_formats(options: BuildLodOptions) -> None:
     """Raise a `click.UsageError` where the options of formats, and the name of the output, contradict each other."""
     form, suffix, output = options.output_form, ending_of(options.name), options.output
     chosen = options.form is not None or output is not None
@@ -235,7 +212,7 @@ def check_formats(ctx: click.Context, options: BuildLodOptions) -> None:
             " refine the .rad files on their own"
         )
     if form.cuts:
-        _check_cuts(ctx, options)
+        _check_cuts(options)
         return
     if form.chunked and output == DASH:
         raise click.UsageError("--format rad-chunked writes several files; name the output, or use --format rad")
@@ -251,10 +228,9 @@ def check_formats(ctx: click.Context, options: BuildLodOptions) -> None:
     if suffix not in ("", *TREES):
         names = f"{', '.join((*TREES.values(), DETAIL))} or {TILED}"
         raise click.UsageError(f"trees are written as {names}, not as {suffix}; name the output {known}")
-    refuse_others(ctx, WRITABLE[form.suffix].name)
 
 
-def _check_cuts(ctx: click.Context, options: BuildLodOptions) -> None:
+def _check_cuts(options: BuildLodOptions) -> None:
     form, output = options.output_form, options.output
     flag = f"--format {MANIFESTS[form.manifest]}"
     if output == DASH:
@@ -264,9 +240,6 @@ def _check_cuts(ctx: click.Context, options: BuildLodOptions) -> None:
             f"{flag} writes {form.manifest} and {form.beside} beside it, not {output.name}; name the output"
             f" {output.parent / output.stem / form.manifest}"
         )
-    refuse_others(ctx, form.cuts, hints=False)
-    if is_set(ctx, "environment"):
-        refuse(ctx, ("environment_beyond",), "cannot be used with --environment")
 
 
 def record_of(source: Source, target: Place, outcome: Outcome | Converted) -> dict[str, Any]:

@@ -19,6 +19,7 @@ import click
 from .. import __version__
 from ..system.setting_fields import MOST_WHOLE, Quantity, Range, Setting, setting, settings_in
 from .console import Verbosity
+from .rules import check
 
 #: Headings of several commands: options that most users need, and options of every command.
 COMMON, GENERAL = "Common options", "General"
@@ -150,6 +151,7 @@ class Command(click.Command):
             raise
         if not ctx.resilient_parsing:
             refuse_output_among_inputs(ctx)
+            check(ctx)
         verbosity = ctx.find_object(Verbosity)
         if verbosity is not None:
             verbosity.verbose = ctx.params.get("verbose", False)
@@ -354,40 +356,6 @@ def parameters_of(*kinds: type[Any]) -> tuple[str, ...]:
     )
 
 
-def check_declared(ctx: click.Context) -> None:
-    """Raise a `click.UsageError` where an option was given without one that it needs, or with one that it excludes."""
-    for param in ctx.command.params:
-        if not isinstance(param, Option) or not is_set(ctx, param.name or ""):
-            continue
-        flag, declared = max(param.opts, key=len), param.declared
-        needed, _, value = declared.needs.partition("=")
-        if needed and (str(ctx.params[needed]) != value if value else not is_set(ctx, needed)):
-            raise click.UsageError(f"{flag} can only be used with {flag_of(ctx, needed)} {value}".rstrip(), ctx)
-        refuse(ctx, declared.excludes, f"cannot be used with {flag}")
-
-
-def is_set(ctx: click.Context, name: str) -> bool:
-    """Return whether a parameter was given, even with its default value."""
-    return ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
-
-
-def flag_of(ctx: click.Context, name: str) -> str:
-    """Return the flag of a parameter, such as --lod-splat-scale for lod_splat_scale."""
-    return next(max(param.opts, key=len) for param in ctx.command.params if param.name == name)
-
-
-def flags_set(ctx: click.Context, names: Iterable[str]) -> list[str]:
-    """Return the flags of those parameters that were given."""
-    return [flag_of(ctx, name) for name in names if is_set(ctx, name)]
-
-
-def refuse(ctx: click.Context, names: Iterable[str], why: str) -> None:
-    """Raise a `click.UsageError`, "--flag WHY", where one of some parameters was given."""
-    for name in names:
-        if is_set(ctx, name):
-            raise click.UsageError(f"{flag_of(ctx, name)} {why}", ctx)
-
-
 COLORS: dict[str, tuple[float, ...] | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 
 #: Pixels along a side of a picture, and digits of no more than a few times that.
@@ -479,7 +447,10 @@ def _numbers(text: str, names: str = "x,y,z") -> tuple[float, ...]:
 def _direction(text: str) -> tuple[float, ...]:
     """Parse an axis by its name (y, -y, ...), or x,y,z."""
     if text.removeprefix("-") not in ("x", "y", "z"):
-        return _numbers(text)
+        numbers = _numbers(text)
+        if not any(numbers):
+            raise ValueError(f"{text} is no direction; give another one")
+        return numbers
     return tuple((-1.0 if text[0] == "-" else 1.0) if name == text[-1] else 0.0 for name in "xyz")
 
 

@@ -14,7 +14,7 @@ from ..system.errors import FormatError, InvalidSplatsError, OutOfMemoryError, n
 from ..system.setting_fields import setting, setting_of
 from ..system.stdio import DASH, name_of
 from .build_lod import record_of, report_baked, report_converted
-from .command import COMMON, Command, check_declared, flag, values_of
+from .command import COMMON, Command, flag, values_of
 from .console import Console, print_json
 from .options.baking import (
     FILE_FORMAT,
@@ -24,7 +24,6 @@ from .options.baking import (
     BuildLodOptions,
     OutputForm,
     SceneOptions,
-    refuse_others,
     write_options,
 )
 from .options.common import EACH_AS_JSON, JSON, OVERWRITE, General
@@ -38,6 +37,7 @@ from .paths import (
     stem_of,
     with_chunks,
 )
+from .rules import check
 
 if TYPE_CHECKING:
     from ..bake.settings import BakeSettings
@@ -193,15 +193,9 @@ def _check(ctx: click.Context, options: ConvertOptions) -> None:
         raise click.UsageError(f"--format {options.form} writes {form.suffix}, not {ending_of(output.name)}")
     if form.chunked and output == DASH:
         raise click.UsageError("--format rad-chunked writes several files; name the output, or use --format rad")
-    check_declared(ctx)
-    if form.suffix in arrays:
-        if options.layout is None:
-            raise click.UsageError(f"{form.suffix} holds arrays; choose their --layout: {', '.join(ENCODINGS)}")
-        refuse_others(ctx, "--layout", hints=False)
-    else:
-        if options.layout is not None:
-            raise click.UsageError(f"--layout writes {', '.join(arrays)}, not {form.suffix}")
-        refuse_others(ctx, WRITABLE[form.suffix].name, hints=False)
+    if form.suffix in arrays and options.layout is None:
+        raise click.UsageError(f"{form.suffix} holds arrays; choose their --layout: {', '.join(ENCODINGS)}")
+    check(ctx, format="--layout" if form.suffix in arrays else WRITABLE[form.suffix].name, suffix=form.suffix)
     unbundled = form.suffix in WRITABLE and form.suffix == WRITABLE[form.suffix].unbundled
     keep_apart(ctx, {"output": with_chunks([output]) if form.chunked or unbundled else [output]})
     claim_stdout(ctx, "output", as_json=options.as_json, binary=True)

@@ -22,10 +22,11 @@ from ..system.stdio import name_of
 from ..system.threads import on_threads
 from ..system.units import format_size
 from ..system.untrusted import MOST, printable, shortened
-from .command import COMMON, Command, check_declared, flag, refuse, values_of
+from .command import COMMON, Command, flag, values_of
 from .console import Console, count_of, rows
 from .options.common import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, assert_errors, table_output
 from .paths import NamedPath, keep_apart, name_outputs
+from .rules import check
 
 if TYPE_CHECKING:
     from ..inspection.findings import Finding
@@ -121,7 +122,6 @@ class InspectOutput:
     stats: bool = flag("Report statistics of all quantities, not only of the main ones.", heading=COMMON)
     field: str | None = setting(
         "Print one value of the JSON report, such as tree.leaves, instead of a report.",
-        excludes=("chunks", "histogram", "style"),
         metavar="NAME",
         heading=COMMON,
     )
@@ -148,25 +148,6 @@ class InspectOutput:
     plot_by: str = setting("What the colours of the picture show.", PLOT_BY, PLOT_BY[0], heading=PICTURES)
 
 
-def check_usage(ctx: click.Context, count: int, checks: Checks, output: InspectOutput, *, as_json: bool) -> None:
-    """Raise a `click.UsageError` where options exclude each other or would do nothing."""
-    check_declared(ctx)
-    if count > 1:
-        refuse(ctx, ("plot", "chunks_out"), f"takes one file, not {count}")
-    if output.stats and checks.holds and not as_json:
-        what = "--check" if checks.check else "expectations"
-        raise click.UsageError(f"--stats cannot be used with {what} unless --json is given")
-    if not checks.holds:
-        refuse(ctx, ("style", "fail_on"), "needs --check or an expectation")
-    if output.plot is None and output.html is None:
-        refuse(ctx, ("plot_level", "plot_by"), "needs --plot or --html")
-    if output.histogram:
-        from ..inspection.values import QUANTITIES
-
-        for name in (each for each in output.histogram if each not in QUANTITIES):
-            raise click.UsageError(f"--histogram: there is no quantity {name}; choose one of {', '.join(QUANTITIES)}")
-
-
 @dataclass(frozen=True)
 class _InspectGeneral(General):
     quiet: bool = flag("Print only what other options ask for, and errors.", **QUIET)
@@ -181,7 +162,7 @@ class InspectOptions:
     )
     checks: Checks = dataclasses.field(default_factory=Checks)
     output: InspectOutput = dataclasses.field(default_factory=InspectOutput)
-    as_json: bool = flag(EACH_AS_JSON, excludes=("field", "histogram", "style"), **JSON)
+    as_json: bool = flag(EACH_AS_JSON, **JSON)
     general: _InspectGeneral = dataclasses.field(default_factory=_InspectGeneral)
 
 
@@ -210,8 +191,13 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
     name_outputs(ctx, ctx.params["files"][0])
     options = values_of(ctx, InspectOptions)
     files, checks, output, general = options.files, options.checks, options.output, options.general
+    check(ctx, count=len(files))
     keep_apart(ctx)
-    check_usage(ctx, len(files), checks, output, as_json=options.as_json)
+    if output.histogram:
+        from ..inspection.values import QUANTITIES
+
+        for name in (each for each in output.histogram if each not in QUANTITIES):
+            raise click.UsageError(f"--histogram: there is no quantity {name}; choose one of {', '.join(QUANTITIES)}")
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.inspect_jobs import check_outputs, read_original
         from ..inspection.blocks import CHUNK_COLUMNS

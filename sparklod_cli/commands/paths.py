@@ -16,8 +16,8 @@ import click
 from ..codecs.formats import MANIFEST, META, TILESET
 from ..system.addresses import Address, Place, place_of
 from ..system.stdio import DASH
-from .command import flag_of
 from .console import is_terminal
+from .rules import flag_of
 
 INPUT, OUTPUT = "an input", "an output"
 

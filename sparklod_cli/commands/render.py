@@ -16,20 +16,16 @@ from ..codecs.formats import ROUND_TRIPS
 from ..images.output import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ..lod.budget import Budget, doubt, parse_budgets
 from ..model import MAX_SH_DEGREE
-from ..render.settings import OF_PIXELS, SORTINGS, RenderSettings, uses_card
+from ..render.settings import SORTINGS, RenderSettings, uses_card
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import format_size, parse_time
 from ..viewers.viewer_settings import BLEND, StreamingSettings
-from .command import COLOR, COMMON, VIEW, Command, check_declared, flag, is_set, refuse, values_of
+from .command import COLOR, COMMON, VIEW, Command, flag, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
 from .options.common import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
 from .options.viewing import (
     AROUND_SCENE,
-    BUDGET,
     CAMERAS,
-    CUTS,
-    DETAIL,
-    LOADING,
     MOST_DRAWN,
     Cameras,
     CutOptions,
@@ -40,6 +36,7 @@ from .options.viewing import (
     with_planes,
 )
 from .paths import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
+from .rules import check, is_set
 
 if TYPE_CHECKING:
     from ..api.comparison import BudgetSummary
@@ -50,22 +47,8 @@ if TYPE_CHECKING:
     from ..model.instances import Instance
     from ..tables.assertions import Assertion
 
-#: Options without an effect on some styles and backends.
-UNSTYLED = {"points": ("profile", "sort"), "billboards": ("profile", "sort"), "sorted-billboards": ("profile",)}
-UNKNOWN_TO = {"osmesa": ("device",), "open3d": ("profile", "sort", "device")}
-
 #: The budgets to compare, unless others are given.
 DEFAULT_BUDGETS = "2%,5%,10%,25%,50%"
-
-#: Options without an effect on --compare and --thumbnail.
-NOT_COMPARED = (
-    *("full", "preset", "lod_splat_scale", "background", "alpha", "supersample", "style", "color_by", "no_bar"),
-    *("through", "diff", "gain", "sheet", "jobs", "thumbnail", "jpeg_quality"),
-)
-NO_THUMBNAIL = (
-    *("size", "supersample", "camera_path", "orbit", "dolly", "look_at", "views", "keyframes", "center", "distance"),
-    *("sheet", "fps", "every"),
-)
 
 #: Heading of options of comparisons: of cuts with full detail (`--compare`), and of one file with another (`--diff`).
 COMPARISON = "Comparison"
@@ -99,11 +82,9 @@ class PictureCut(CutOptions):
     budget: tuple[Budget, ...] | None = setting(
         f"{MOST_DRAWN}; with --compare several, such as 5%,500k.  [default: that of --preset]",
         Quantity("N|P%,...", parse_budgets),
-        **BUDGET,
+        heading=COMMON,
     )
-    full: bool = flag(
-        "Draw full detail: all leaves, however many there are.", heading=COMMON, excludes=(*CUTS, *DETAIL)
-    )
+    full: bool = flag("Draw full detail: all leaves, however many there are.", heading=COMMON)
     continuous: bool = flag(
         "Blend nodes and their children where one replaces the other, so that nothing pops; draws 18 to 40 % more"
         " splats than the budget."
@@ -111,7 +92,6 @@ class PictureCut(CutOptions):
     blend: float | None = setting(
         f"With --continuous: ratio of the pixel scales between which nodes blend.  [default: {BLEND:g}]",
         Range(above=1),
-        needs="continuous",
     )
 
 
@@ -139,35 +119,12 @@ class Appearance:
         "With --backend osmesa: sort exactly, or by 16 bits of the depth as antimatter15's viewer does (counting16)."
         "  [default: exact]",
         SORTINGS,
-        needs="backend=osmesa",
     )
     sort_throttle: float | None = setting(
         "With --backend osmesa: keep the order until the cosine between the view directions falls below 1 - X, such as"
         " 0.01.  [default: 0]",
         Range(0, 2),
-        needs="backend=osmesa",
     )
-
-    def check(self, ctx: click.Context) -> None:
-        render, raster = self.render, self.render.raster
-        if not raster.near < raster.far:
-            raise click.UsageError(f"--near {raster.near:g} must be less than --far {raster.far:g}")
-        if render.style != "splats":
-            refuse(
-                ctx,
-                ["backend", "device"],
-                f"cannot be used with --style {render.style}, which every picture gets from one renderer",
-            )
-        refuse(ctx, UNSTYLED.get(render.style, ()), f"cannot be used with --style {render.style}")
-        refuse(ctx, UNKNOWN_TO.get(render.backend, ()), f"cannot be used with --backend {render.backend}")
-        if render.color_by == "overdraw":
-            refuse(
-                ctx,
-                ["sort", "style", "backend", "device"],
-                "cannot be used with --color-by overdraw, which counts splats",
-            )
-        if is_set(ctx, "background") and self.background is not None:
-            refuse(ctx, ["alpha"], "cannot be used with --background, which fills what is transparent")
 
     def settings(self, say: Callable[[str], None]) -> RenderSettings:
         """Return the settings of pictures with the options of the backend; `say` receives a line on the device."""
@@ -219,7 +176,6 @@ class RenderOptions:
         f"Draw a small picture of the whole scene: {THUMBNAIL_SIZE[0]}x{THUMBNAIL_SIZE[1]} pixels, each the mean of"
         f" {THUMBNAIL_SUPERSAMPLE} x {THUMBNAIL_SUPERSAMPLE} samples, to NAME-thumbnail.png.",
         heading=COMMON,
-        excludes=NO_THUMBNAIL,
     )
     sheet: bool = flag("Put the pictures of all cameras on one contact sheet.")
     jobs: int = setting(
@@ -234,32 +190,25 @@ class RenderOptions:
         " the camera; with --bandwidth.  [default: what is drawn once every chunk has arrived]",
         Quantity("TIME", parse_time),
         heading=StreamingSettings.HEADING,
-        needs="bandwidth",
-        excludes=("full", "continuous", "compare"),
     )
     streaming: StreamingSettings = field(default_factory=StreamingSettings)
     appearance: Appearance = field(default_factory=Appearance)
     compare: bool = flag(
         "Measure how far the cuts of each --budget are from full detail, as a table instead of pictures.",
         heading=COMPARISON,
-        excludes=NOT_COMPARED,
     )
     asserts: tuple[str, ...] = setting(
         "With --compare: a condition that must hold, such as 'psnr_min>30', or '5%:psnr>30' for one of the budgets; the"
         " exit status is 3 if it does not.",
         **ASSERT,
         heading=COMPARISON,
-        needs="compare",
     )
-    plot: Path | None = setting(
-        "With --compare: draw charts of the table as a .png.", PNG, heading=COMPARISON, needs="compare"
-    )
+    plot: Path | None = setting("With --compare: draw charts of the table as a .png.", PNG, heading=COMPARISON)
     max_sh: int = setting(
         "With --compare: highest degree of spherical harmonics to draw.",
         whole(0, MAX_SH_DEGREE),
         MAX_SH_DEGREE,
         heading=COMPARISON,
-        needs="compare",
     )
     diff: Path | None = setting(
         "Draw the difference from the picture of another file, and print its PSNR.", NamedPath(), heading=COMPARISON
@@ -268,7 +217,6 @@ class RenderOptions:
         "Factor by which --diff multiplies differences.  [default: chosen for the pictures]",
         Range(above=0),
         heading=COMPARISON,
-        needs="diff",
     )
     as_json: bool = flag("Print what was drawn as one JSON object on standard output.", **JSON)
     general: General = field(default_factory=General)
@@ -307,19 +255,13 @@ def render(ctx: click.Context, /, **_: Any) -> None:
     """
     if ctx.params["compare"]:
         name_outputs(ctx, ctx.params["scene"] or next(iter(ctx.params["files"]), None))
-    check_declared(ctx)
     options = values_of(ctx, RenderOptions)
     look = options.appearance
-    if options.diff is not None:
-        refuse(ctx, ["color_by"], "cannot be used with --diff, which compares the splats' own colours")
-        if look.alpha or look.background is None:
-            raise click.UsageError("--diff compares pictures without alpha; name a --background such as black")
-    elif not options.compare and look.render.color_by is None:
-        refuse(ctx, ["no_bar"], "can only be used with --color-by or --diff")
-    options.cameras.check(ctx)
-    if options.after is None:
-        refuse(ctx, LOADING, "can only be used with --after")
-    look.check(ctx)
+    if options.diff is not None and (look.alpha or look.background is None):
+        raise click.UsageError("--diff compares pictures without alpha; name a --background such as black")
+    if not look.render.raster.near < look.render.raster.far:
+        near, far = look.render.raster.near, look.render.raster.far
+        raise click.UsageError(f"--near {near:g} must be less than --far {far:g}")
     claim_stdout(ctx, "output", as_json=options.as_json)
     if options.compare:
         ctx.exit(_compare(ctx, options))
@@ -398,8 +340,7 @@ def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> Picture
         output = output_for(named, name, cameras, sheet=options.sheet or len(options.cameras.views) > 1)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
-    if output.form != "jpg":
-        refuse(ctx, ["jpeg_quality"], "can only be used with a .jpg")
+    check(ctx, picture=output.form)
     return output
 
 
@@ -412,9 +353,6 @@ def _place(
     from ..images.sequence import PictureSettings, frame_rate
 
     look, output = options.appearance, _output(ctx, options, len(path.cameras))
-    if output.form == "npy":
-        without = ("no_bar",) if look.render.color_by not in OF_PIXELS else ("no_bar", "background", "alpha")
-        refuse(ctx, without, "cannot be used with a .npy, which holds numbers")
     background = None if look.alpha else look.background
     if background is None and output.form not in WITH_ALPHA:
         raise click.UsageError(

@@ -22,7 +22,7 @@ from ..system.setting_fields import Quantity, Range, setting, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
 from .build_lod import record_of, report_baked
-from .command import COMMON, Command, OptionalNumber, check_declared, flag, flags_set, is_set, values_of
+from .command import COMMON, Command, OptionalNumber, flag, values_of
 from .console import Console, print_json, say
 from .options.baking import (
     BY_SIZE,
@@ -35,11 +35,11 @@ from .options.baking import (
     BuildLodOptions,
     SceneOptions,
     memory_size,
-    refuse_others,
     write_options,
 )
 from .options.common import EACH_AS_JSON, JSON, OVERWRITE, General
 from .paths import NAMELESS, Folder, NamedPath, claim_stdout, keep_apart, require_suffix, stem_of, with_chunks
+from .rules import GOALS, check, flags_set
 
 if TYPE_CHECKING:
     from ..api.bake_jobs import BakeSettings
@@ -56,9 +56,6 @@ EXAMPLES = """\
   sparklod simplify tiles/*.ply --to 1M --up -y -o city.sog # one scene of all
   sparklod simplify scene-lod.rad --to 5% -o small.ply      # a cut of its tree
 """
-
-#: Ways to say how many splats are left, by parameter.
-GOALS = ("to", "max_bytes", "psnr")
 
 
 @dataclass(frozen=True)
@@ -96,7 +93,6 @@ class SimplifyOptions:
         is_flag=False,
         flag_value=BY_SIZE,
         heading=COMMON,
-        excludes=("max_bytes",),
     )
     seed: int = setting_of(FitSettings, "seed")
     device: str = setting_of(FitSettings, "device")
@@ -200,21 +196,14 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
 
 def _check(ctx: click.Context, options: SimplifyOptions) -> None:
     """Raise a `click.UsageError` where options contradict each other, or the names of options."""
-    given = flags_set(ctx, GOALS)
-    if len(given) != 1:
-        what = f"{' and '.join(given)} cannot be used together; give" if given else "say how many splats to keep: give"
-        raise click.UsageError(f"{what} one of --to, --max-bytes and --psnr")
+    if not flags_set(ctx, GOALS):
+        raise click.UsageError("say how many splats to keep: give one of --to, --max-bytes and --psnr")
     require_suffix("--output", options.output, WRITABLE)
     if options.suffix not in WRITABLE:
         raise click.UsageError(f"--output writes {', '.join(WRITABLE)}, not {options.suffix}")
-    check_declared(ctx)
-    if options.camera_path is not None and options.psnr is None and options.refine is None:
-        raise click.UsageError("--camera-path can only be used with --psnr or --refine")
     form = WRITABLE[options.suffix]
     keep_apart(ctx, {"output": with_chunks([options.output]) if form.unbundled == options.suffix else [options.output]})
     claim_stdout(ctx, "output", as_json=options.as_json, binary=True)
     if DASH in options.inputs and len(options.inputs) > 1:
         raise click.UsageError("standard input cannot be merged with files; save it to a file first")
-    if is_set(ctx, "rgba") and len(options.inputs) > 1:
-        raise click.UsageError(f"--rgba takes one input, not {len(options.inputs)}")
-    refuse_others(ctx, form.name, hints=False)
+    check(ctx, count=len(options.inputs), format=form.name)

@@ -18,11 +18,12 @@ from ..system.units import format_size, percent_of
 from ..system.untrusted import printable
 from ..tables.columns import FORMS
 from ..viewers.viewer_settings import StreamingSettings
-from .command import COMMON, Command, check_declared, flag, refuse, values_of
+from .command import COMMON, Command, flag, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
 from .options.common import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
 from .options.viewing import Cameras, CutOptions, Inputs, check_view, files_read, scenes_of
 from .paths import NamedPath, claim_stdout, keep_apart, name_outputs
+from .rules import check
 
 if TYPE_CHECKING:
     from ..simulation.results import FrameOutputs, Summary
@@ -44,9 +45,6 @@ EXAMPLES = """\
   sparklod traverse scene-lod.spz \\
     --look-at 0,-1,4:0,0,0 --indices-out cuts --padded
 """
-
-#: Options of the content of the table.
-OF_TABLES = ("form", "per_instance", "no_timing")
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,6 @@ class TraverseOptions:
     )
     padded: bool = flag(
         "With --indices-out: pad each file to rows of 16,384 nodes, as Spark's index texture has them.",
-        needs="indices_out",
     )
 
     inputs: Inputs = field(default_factory=Inputs)
@@ -103,9 +100,7 @@ class TraverseOptions:
         columns = [each for each in COLUMNS if each.name not in TIMING or not self.no_timing]
         table = table_output(self.output, columns, overwrite=self.overwrite, as_json=self.as_json, form=self.form)
         if table.form is None:
-            none = "cannot be used with --json without --output, which writes no table"
-            summary = "is of the table, and a terminal gets the summary; redirect it, or add --output"
-            refuse(ctx, OF_TABLES, none if self.as_json else summary)
+            check(ctx, table="none")
         return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)
 
     def assertions(self) -> list[Assertion]:
@@ -133,10 +128,8 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     Coordinates are those of the files; --up, --world-transform and --camera-axes bring cameras into them.
     """
     name_outputs(ctx, ctx.params["scene"] or next(iter(ctx.params["files"]), None))
-    check_declared(ctx)
     options = values_of(ctx, TraverseOptions)
     general = options.general
-    options.cameras.check(ctx)
     claim_stdout(ctx, "output", as_json=options.as_json)
     budget = options.cut.one_budget()
     instances = options.inputs.instances()

@@ -16,7 +16,7 @@ from ..lod.budget import doubt
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import format_size, parse_count
 from ..system.untrusted import printable
-from .command import COMMON, DIRECTION, VIEW, Command, check_declared, flag, values_of
+from .command import COMMON, DIRECTION, VIEW, Command, flag, values_of
 from .console import Console, count_of, print_json
 from .options.common import DEFAULT_UP, JSON, OVERWRITE, QUIET, UP, VERBOSE, General
 from .paths import NamedPath, keep_apart
@@ -78,9 +78,8 @@ class _Place:
         "Write the page and the files into a folder, for any web server, in place of serving them.",
         NamedPath(output=True, folder=True),
         heading=COMMON,
-        excludes=("host", "port", "cors", "no_open"),
     )
-    overwrite: bool = flag(**OVERWRITE, needs="export")
+    overwrite: bool = flag(**OVERWRITE)
     port: int = setting("Port to listen on.", whole(0, 65_535), 0, show_default="any that is free")
     host: str = setting(
         "Address to listen on; 0.0.0.0 lets everybody on the network read the files.",
@@ -128,7 +127,6 @@ def view(ctx: click.Context, /, **_: Any) -> None:
     options = values_of(ctx, _ViewOptions)
     files, page, place, general = options.files, options.page, options.place, options.general
     keep_apart(ctx)
-    check_declared(ctx)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api import viewing
 

@@ -28,9 +28,9 @@ class FitSettings(CheckedSettings):
     steps: int | None = setting(
         "Pictures of cuts that are drawn and compared; None for a number that suits the size of the tree.", STEPS
     )
-    seed: int = setting(SEED_HELP, SEED, 0, needs="refine")
+    seed: int = setting(SEED_HELP, SEED, 0)
     path: CameraPath | None = None
-    device: str = setting(FIT_DEVICE_HELP, DEVICES, "cpu", needs="refine")
+    device: str = setting(FIT_DEVICE_HELP, DEVICES, "cpu")
 
 
 @dataclass(frozen=True)

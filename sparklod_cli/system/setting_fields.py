@@ -89,8 +89,6 @@ class Setting:
         kind: a `Range`, a `Quantity`, a tuple of choices, or a parameter type of the command line; None for text, and
             for flags, whose default is False.
         name: of the parameter of a command, from which its flag is made; empty for that of the field.
-        needs: parameter without which the option does nothing; with "=VALUE", one that must have that value.
-        excludes: parameters that cannot be given together with the option.
         only_api: the command line has no such option.
         attributes: further ones of the option.
     """
@@ -98,8 +96,6 @@ class Setting:
     help: str
     kind: Any = None
     name: str = ""
-    needs: str = ""
-    excludes: tuple[str, ...] = ()
     only_api: bool = False
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
@@ -110,13 +106,11 @@ def setting(
     default: Any = None,
     *,
     name: str = "",
-    needs: str = "",
-    excludes: tuple[str, ...] = (),
     only_api: bool = False,
     **attributes: Any,
 ) -> Any:
     """Return a dataclass field with a `Setting`, whose attributes the arguments are, and a default value."""
-    declared = Setting(help, kind, name, needs, excludes, only_api, attributes)
+    declared = Setting(help, kind, name, only_api, attributes)
     return field(default=default, metadata={SETTING: declared})
 
 

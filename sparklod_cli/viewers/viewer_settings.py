@@ -78,7 +78,6 @@ class DetailRule(CheckedSettings):
         Range(LEAST_BASE_DISTANCE),
         5.0,
         name="lod_base_distance",
-        needs="budget_mode=limit",
     )
     multiplier: float = setting(
         "Ratio of the distances at which successive levels begin.", Range(1.2), 3.0, name="lod_multiplier"
@@ -94,7 +93,6 @@ class DetailRule(CheckedSettings):
         whole(0, 100),
         0,
         name="lod_underfill",
-        needs="bandwidth",
     )
 
     def __post_init__(self) -> None:
@@ -122,7 +120,6 @@ class LodSettings(CheckedSettings):
         "Stop refining nodes of this size over distance, or smaller.  [default: that of a pixel, times"
         " --lod-render-scale]",
         FACTOR,
-        excludes=("lod_render_scale",),
     )
     render_scale: float = setting(
         "Stop refining nodes smaller than this many pixels.", FACTOR, 1.0, name="lod_render_scale"
@@ -167,13 +164,11 @@ class Network(CheckedSettings):
         "Time from a request to the first byte, such as 60ms.  [default: 0ms]",
         Quantity("TIME", parse_time, Range(0, below=math.inf)),
         0.0,
-        needs="bandwidth",
     )
     fetchers: int | None = setting(
         f"Number of chunks that are fetched at a time.  [default: {FETCHERS}; {PLAYCANVAS_FETCHERS} of Streamed SOG,"
         f" {CESIUM_FETCHERS} of 3D Tiles]",
         whole(1, 1000),
-        needs="bandwidth",
     )
 
     @property

@@ -43,11 +43,10 @@ def scene_of_shells() -> Balls:
 def run(*arguments: str | Path, scene: Any = scene_of_shells) -> tuple[Result, list[CameraPath]]:
     found: list[CameraPath] = []
 
-    @click.command("fly", cls=Command, options=Flight)
+    @click.command("traverse", cls=Command, options=Flight)
     @click.pass_context
     def fly(ctx: click.Context, **_: Any) -> None:
         asked = values_of(ctx, Flight)
-        asked.check(ctx)
         found.append(asked.path(lambda: SimpleNamespace(balls=scene, up=None)))
 
     return CliRunner().invoke(fly, [str(argument) for argument in arguments]), found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,7 +11,7 @@ import click
 
 from ...codecs.formats import MANIFEST, TILESET, WRITABLE, ending_of
 from ...codecs.formats import RAD_SUFFIX as RAD
-from ...codecs.options import MAX_SH_CODES, SH_CODES, RadOptions, SogOptions, WriteOptions
+from ...codecs.options import MAX_SH_CODES, SH_CODES, SogOptions, WriteOptions
 from ...fitting import FIT_DEVICE_HELP, SEED, SEED_HELP, STEPS
 from ...lod.tree_settings import (
     BUILDERS,
@@ -33,8 +32,9 @@ from ...system.addresses import Place
 from ...system.setting_fields import Quantity, Range, setting, whole
 from ...system.stdio import DASH
 from ...system.units import parse_size
-from ..command import BALL, COMMON, POINT, OptionalNumber, flag, flags_set, parameters_of, refuse
+from ..command import BALL, COMMON, POINT, OptionalNumber, flag, parameters_of
 from ..paths import NamedPath, stem_of
+from ..rules import flags_set
 from .common import EACH_AS_JSON, JSON, OUTPUT, OVERWRITE, General
 
 if TYPE_CHECKING:
@@ -179,9 +179,6 @@ class SceneOptions:
 _BUILT = ("method", "max_sh", *(builder.setting for builder in BUILDERS.values()))
 OF_TREES = (*_BUILT, *parameters_of(SceneOptions), "environment_beyond")
 
-#: Parameters of bakes on several processes.
-OF_CLUSTERS = ("workers", "scheduler")
-
 
 def write_options(options: WriteOptions, sh_codes: int | None, *, chunked: bool = False) -> WriteOptions:
     """Return write options with those of the command; defaults are left to the library, which knows the input."""
@@ -262,11 +259,10 @@ class BuildLodOptions:
         "Cameras that --refine fits for, in the coordinates of the output, in any format that render reads: those of"
         " visitors whose paths are known.  [default: cameras around and inside the scene]",
         NamedPath(),
-        needs="refine",
         heading=REFINING,
     )
-    seed: int = setting(SEED_HELP, SEED, 0, needs="refine", heading=REFINING)
-    device: str = setting(FIT_DEVICE_HELP, DEVICES, "cpu", needs="refine", heading=REFINING)
+    seed: int = setting(SEED_HELP, SEED, 0, heading=REFINING)
+    device: str = setting(FIT_DEVICE_HELP, DEVICES, "cpu", heading=REFINING)
     method: str | None = setting(
         "How splats are merged: quick takes seconds; quality takes longer, and its cuts come closer to full detail."
         f"  [default: {METHOD}; {METHOD_OF_DETAIL} with --format {STREAMED_SOG} or {TILES_3D}]",
@@ -359,6 +355,17 @@ class BuildLodOptions:
         refines_rad = self.refine is not None and {each.suffix.lower() for each in self.inputs} == {RAD}
         return OutputForm(ending_of(self.name) or (RAD if refines_rad else SPZ))
 
+    @property
+    def builder(self) -> str:
+        """Builder of the tree, by --method, or else by the format."""
+        return self.method or (METHOD_OF_DETAIL if self.output_form.cuts else METHOD)
+
+    @property
+    def format(self) -> str:
+        """Name of the format that is written; empty if there is none for the suffix."""
+        form = self.output_form
+        return form.cuts or (WRITABLE[form.suffix].name if form.suffix in WRITABLE else "")
+
     def target(self, source: Place) -> Place:
         """Return the output for an input."""
         if self.output is not None:
@@ -384,13 +391,9 @@ class BuildLodOptions:
 
             refine = FitSettings(self.refine or None, self.seed, device=self.device)
         form = self.output_form
-        method = self.method or (METHOD_OF_DETAIL if form.cuts else METHOD)
-        for other, builder in BUILDERS.items():
-            if other != method:
-                refuse(ctx, [builder.setting], f"is an option of --method {other}, not of {method}")
         growth = DETAIL_GROWTH if form.cuts else DEFAULT_GROWTH
         return BakeSettings(
-            method=method,
+            method=self.builder,
             base=self.base,
             growth=growth if self.growth is None else self.growth,
             max_sh=self.max_sh,
@@ -405,26 +408,3 @@ class BuildLodOptions:
             camera_path=self.camera_path,
             converts=self.form is not None or ending_of(self.name) in TREES or bool(form.cuts),
         )
-
-
-#: Parameters of formats, the names of these, and how to get one of them.
-OF_FORMATS: tuple[tuple[Iterable[str], tuple[str, ...], str], ...] = (
-    (("spz_version", "fractional_bits"), ("SPZ",), ""),
-    (parameters_of(RadOptions), ("RAD",), "; name the output .rad, or add --format rad"),
-    (("compression_level",), ("SPZ", "RAD"), ""),
-    (("glb_profile",), ("GLB", TILED), "; GLB is written by convert and simplify"),
-    (("cluster_sh",), ("RAD", "SOG"), "; name the output .rad, or add --format rad"),
-    (
-        (*parameters_of(DetailSettings), "environment", "environment_beyond"),
-        (DETAIL,),
-        f"; name the output {MANIFEST}, or add --format {STREAMED_SOG}",
-    ),
-    (parameters_of(TileSettings), (TILED,), f"; name the output {TILESET}, or add --format {TILES_3D}"),
-)
-
-
-def refuse_others(ctx: click.Context, written: str, *, hints: bool = True) -> None:
-    """Raise a `click.UsageError` where an option of another format than the one that is written was given."""
-    for names, formats, hint in OF_FORMATS:
-        if written not in formats and not (written == DETAIL and "SOG" in formats):
-            refuse(ctx, names, f"is an option of {' and '.join(formats)}, not of {written}{hint if hints else ''}")

@@ -20,9 +20,10 @@ from ...system.errors import CameraPathError, TooManyCamerasError
 from ...system.setting_fields import Quantity, Range, setting, whole
 from ...system.units import check_grouping
 from ...system.untrusted import printable
-from ...viewers.viewer_settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS, DetailRule, LodSettings, Network
-from ..command import COMMON, DIRECTION, POINT, SIZE, VIEW, VIEWS, flag, flag_of, is_set, parameters_of, refuse
+from ...viewers.viewer_settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS, LodSettings, Network
+from ..command import COMMON, DIRECTION, POINT, SIZE, VIEW, VIEWS, flag
 from ..paths import NamedPath, file_of
+from ..rules import check, is_set
 from .common import DEFAULT_UP, UP, General
 
 if TYPE_CHECKING:
@@ -33,25 +34,8 @@ if TYPE_CHECKING:
     from ...viewers.scenes import Scenes
     from ..console import Console
 
-#: The options that are each a source of cameras, of which one can be given.
-SOURCES = ("camera_path", "orbit", "dolly", "look_at", "keyframes", "views")
-
-#: Sources that are paths: their cameras follow each other in time.
-PATHS = ("camera_path", "orbit", "dolly", "keyframes")
-
-#: Name of the default source of pictures: one camera that sees the whole scene.
-AROUND = "around"
-
-#: Sources with which these options have an effect, AROUND among them.
-ONLY_WITH = {
-    "camera_format": ("camera_path",),
-    "camera_axes": ("camera_path",),
-    "center": ("orbit", "dolly", AROUND),
-    "distance": ("orbit", "dolly", AROUND),
-    "elevation": ("orbit", "dolly", AROUND),
-    "seconds": ("orbit", "dolly", "keyframes", AROUND),
-    "world_transform": ("camera_path", "look_at", "views", "keyframes"),
-}
+#: Sources of cameras whose coordinates are given, so that nothing about them is chosen for the scene.
+FIXED = ("camera_path", "look_at", "views", "keyframes")
 
 #: Characters of a --world-transform given as numbers; any other text names a file.
 NUMERIC = set("0123456789+-.,eE ")
@@ -133,24 +117,6 @@ class Cameras:
     #: Without a source there is one camera that sees the whole scene, in place of an orbit.
     still: ClassVar[bool] = False
 
-    def check(self, ctx: click.Context) -> None:
-        sources = [name for name in SOURCES if getattr(self, name)]
-        if len(sources) > 1:
-            flags = " and ".join(flag_of(ctx, name) for name in sources)
-            raise click.UsageError(f"{flags} cannot be used together; give one source of cameras")
-        source = sources[0] if sources else AROUND if self.still else "orbit"
-        for name, known in ONLY_WITH.items():
-            if is_set(ctx, name) and source not in known:
-                named = [flag_of(ctx, each) for each in known if each in ctx.params]
-                refuse(ctx, [name], f"can only be used with {' or '.join(named)}")
-        if source not in PATHS:
-            still = "cannot be used with a camera that does not move; give a path, such as --orbit"
-            refuse(ctx, ("fps", "every", "seconds"), still)
-        if source == "orbit" and self.seconds is not None:
-            refuse(ctx, ["fps"], "cannot be used with --seconds of an orbit, which decides it")
-        if self.up is not None and not any(self.up):
-            raise click.UsageError("--up 0,0,0 is no direction; give another one")
-
     def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
         """Return the cameras; scenes are read only where cameras are chosen for them, or need their up axis."""
         from ...cameras import sources
@@ -186,8 +152,8 @@ class Cameras:
                 settings = replace(settings, fps=count / self.seconds)
             return sources.orbit(count, self.center, self.distance, elevation, settings, lambda: scenes().balls())
         except TooManyCamerasError as error:
-            source = next((name for name in SOURCES if getattr(self, name)), "orbit")
-            raise click.UsageError(f"--{source.replace('_', '-')}: {error}") from None
+            source = next((name for name in ("dolly", "keyframes") if getattr(self, name)), "orbit")
+            raise click.UsageError(f"--{source}: {error}") from None
 
 
 def _world(value: str) -> Matrix:
@@ -204,20 +170,6 @@ def _world(value: str) -> Matrix:
 
 #: A key of `PRESETS`.
 DEFAULT_PRESET = "desktop"
-
-#: Options of the size on the screen, pixels, which 3D Tiles have, too.
-OF_PIXELS = ("lod_render_scale", "pixel_scale_limit")
-
-#: Options of the foveation cones, which --outside-foveate replaces, and of nodes, which Streamed SOG does not have.
-CONES = ("cone_fov0", "cone_fov", "cone_foveate")
-NODES = (*(*OF_PIXELS, *CONES, "outside_foveate", "behind_foveate"), *("precision", "continuous", "blend"))
-
-#: Options of cuts, which have no effect where full detail is drawn.
-CUTS = ("budget", "preset", "lod_splat_scale", *NODES)
-
-#: Options for Streamed SOG alone, and options of loading, without which all chunks are resident.
-DETAIL = parameters_of(DetailRule)
-LOADING = ("after", "bandwidth", "latency", "fetchers", "chunk_cache")
 
 #: Angles of cones, and weights of nodes where 1 is that of nodes in the middle.
 DEGREES = Range(0, 180, unit="DEGREES")
@@ -241,8 +193,6 @@ class Inputs:
 
         if not self.files and self.scene is None:
             raise click.UsageError("a FILE is missing; name one, or an instances file with --scene")
-        if self.files and self.scene is not None:
-            raise click.UsageError("FILE cannot be used with --scene, which names the files")
         if self.scene is None:
             return instances_of(self.files)
         from ...viewers.instances_file import read_instances
@@ -250,9 +200,8 @@ class Inputs:
         return read_instances(self.scene)
 
 
-#: Help of `--budget`, and further attributes.
+#: Help of `--budget`.
 MOST_DRAWN = "Largest number of splats to draw, such as 500k, or a share of the leaves, such as 5%"
-BUDGET: dict[str, Any] = {"heading": COMMON, "excludes": ("preset",)}
 
 
 @dataclass(frozen=True)
@@ -262,7 +211,7 @@ class CutOptions:
     HEADING: ClassVar[str] = "Cut"
 
     budget: tuple[Budget, ...] | None = setting(
-        f"{MOST_DRAWN}.  [default: that of --preset]", Quantity("N|P%", parse_budgets), **BUDGET
+        f"{MOST_DRAWN}.  [default: that of --preset]", Quantity("N|P%", parse_budgets), heading=COMMON
     )
     preset: str | None = setting(
         "Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
@@ -281,7 +230,6 @@ class CutOptions:
     outside_foveate: float | None = setting(
         "Priority of nodes outside the frustum, in place of the cones, as in Spark's LoD design.",
         FACTOR,
-        excludes=CONES,
     )
     behind_foveate: float | None = setting(
         f"Priority of nodes behind the camera.  [default: {BEHIND_FOVEATE:g}; 1 with --outside-foveate]", FACTOR
@@ -359,22 +307,9 @@ def check_view(
 ) -> None:
     """Print notes on the cameras, further ones, and those on scenes; refuse options for other kinds of files."""
     from ...model.scene import up_notes_of
-    from ...viewers.loaded_scene import STREAMED_SOG, TILES, TREE
+    from ...viewers.loaded_scene import TREE
 
-    if scenes.kind == STREAMED_SOG:
-        streamed = "is for trees; use --budget, --budget-mode and --lod-multiplier for Streamed SOG"
-        refuse(ctx, (*NODES, "chunk_cache", "indices_out", "padded"), streamed)
-    elif scenes.kind == TILES:
-        tiled = "is not for 3D Tiles, which CesiumJS draws without a budget; --lod-render-scale 2 halves their detail"
-        others = (each for each in (*CUTS, *DETAIL, "indices_out", "padded") if each not in OF_PIXELS)
-        refuse(ctx, (*others, "chunk_cache"), tiled)
-    elif scenes.kind == TREE:
-        refuse(ctx, DETAIL, "is for Streamed SOG, and no file is; --budget and --preset are for trees, too")
-    else:
-        plain = (
-            "is for Level-of-Detail files, and no file is one, so that all splats are drawn; bake one with build-lod"
-        )
-        refuse(ctx, (*CUTS, *LOADING, *DETAIL), plain)
+    check(ctx, scenes=scenes.kind)
     upright = cameras.up is None and cameras.camera_path is None  # by the axes of the files
     for note in (*path.notes, *notes, *(up_notes_of(scenes.axes) if upright else ())):
         console.say(note)
@@ -395,7 +330,7 @@ def with_planes(
 
     So a view of the whole scene clips nothing. Planes that were given stay.
     """
-    fixed = cameras.distance is not None or any(getattr(cameras, name) for name in ONLY_WITH["world_transform"])
+    fixed = cameras.distance is not None or any(getattr(cameras, name) for name in FIXED)
     if fixed or any(is_set(ctx, name) for name in ("near", "far")):
         return render
     from ...cameras.framing import reach

@@ -113,8 +113,8 @@ def test_what_is_in_the_way_is_left(tmp_path: Path, capsys: Capture) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--lat", 47], "lat and lon go together; give both"),
-        (["--heading", 47], "give lat and lon, too"),
+        (["--lat", 47], "--lat and --lon go together; give both"),
+        (["--heading", 47], "give --lat and --lon, too"),
         (["--lat", 91, "--lon", 0], "91"),
         (["--lat", 1, "--lon", 0, "--transform", "1 0 0 0 0 1 0 0 0 0 1 0 7 8 9 1"], "cannot be used with"),
         (["--transform", "1,2,3"], "is not 16 finite numbers"),

@@ -45,7 +45,7 @@ from tests.conftest import FIXTURES, ROOT, Capture
         ([TREE, "--look-at", "0,0,0:0,0,0"], "looks at its own eye"),
         ([TREE, "--keyframes", "0,0,0:1,0,0"], "two keyframes"),
         ([TREE, "--size", "0x720"], "--size"),
-        ([TREE, "--up", "0,0,0"], "--up 0,0,0 is no direction"),
+        ([TREE, "--up", "0,0,0"], "0,0,0 is no direction"),
         ([TREE, "-o", "t.xlsx"], "--output t.xlsx: tables are written as .csv, .json, .parquet"),
         ([TREE, "-o", "t.png"], "--output t.png: tables are written as .csv"),
         ([TREE, "-o", "t.spz", "--format", "json"], "t.spz does not end in .json, which --format asks for"),
