@@ -14,7 +14,7 @@ from sparklod_cli.cli import cli, run
 from sparklod_cli.codecs.options import RadOptions
 from sparklod_cli.commands.command import Option
 from sparklod_cli.commands.rules import LEVELS, RAD, RULES, STREAMED_SOG, TILES_3D, Rule, flag_of
-from sparklod_cli.lod.part_settings import DetailSettings, TileSettings
+from sparklod_cli.lod.tree_settings import DetailSettings, TileSettings
 from sparklod_cli.system.setting_fields import Quantity, Range, settings_in
 from sparklod_cli.viewers.viewer_settings import DetailRule
 from tests.conftest import FIXTURES, Capture
