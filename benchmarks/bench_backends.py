@@ -20,8 +20,8 @@ from sparklod_cli.cameras.framing import framing
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade
+from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.render.renderer import MODULES
-from sparklod_cli.render.settings import RasterSettings
 from sparklod_cli.system.errors import SparklodError
 
 HEADINGS = (

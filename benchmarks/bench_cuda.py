@@ -28,8 +28,8 @@ from sparklod_cli.fitting.fit import AHEAD, MOST_SHARE, RATES, raster_for
 from sparklod_cli.fitting.pictures import TRAINING, FittedNodes, FullDetailPicture, Optimiser, Place, pictures, placed
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.render.cuda.card import find_card, to_card
-from sparklod_cli.render.cuda.rasterizer import CardSplats, CardView, draw_on_card
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.cuda.card_rasterizer import CardSplats, CardView, draw_on_card
+from sparklod_cli.render.render_settings import RasterSettings
 
 #: Share of the leaves of the cut that a step draws.
 SHARE = 0.1

@@ -16,7 +16,7 @@ from performance.machine import machine
 from performance.rows import Row, Table, figure, label, ratio
 
 from sparklod_cli.render import gradients
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.system.threads import on_threads
 
 TABLE = Table(

@@ -25,7 +25,7 @@ from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.rasterizer import shade
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.system.progress import silent
 
 SHARES = (0.5, 0.25, 0.12, 0.06)

@@ -20,7 +20,7 @@ import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.render.rasterizer import ShadedSplats, draw, shade
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 
 #: Width and height in pixels, and numbers of splats.
 SIZE, SPLATS = (1280, 720), (100_000, 500_000, 1_500_000)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from sparklod_cli.io.reading import read_scene
-from sparklod_cli.render.settings import SORTS, RasterSettings
+from sparklod_cli.render.render_settings import SORTS, RasterSettings
 from tests.interop.page import Page
 from tests.interop.pictures import AROUND, Difference, cameras_around, compare
 

@@ -18,7 +18,7 @@ import click
 
 import sparklod_cli
 from sparklod_cli.api import comparison
-from sparklod_cli.cameras.formats.table import FORMATS as CAMERA_FORMATS
+from sparklod_cli.cameras.camera_formats import FORMATS as CAMERA_FORMATS
 from sparklod_cli.cli import cli
 from sparklod_cli.commands.command import Command
 from sparklod_cli.inspection.findings import CODES

@@ -52,8 +52,8 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .model.selection import Selection as Selection
     from .model.splats import Splats as Splats
     from .model.transforms import Transform as Transform
-    from .render.settings import RasterSettings as RasterSettings
-    from .render.settings import RenderSettings as RenderSettings
+    from .render.render_settings import RasterSettings as RasterSettings
+    from .render.render_settings import RenderSettings as RenderSettings
     from .system.errors import BackendError as BackendError
     from .system.errors import CameraPathError as CameraPathError
     from .system.errors import FormatError as FormatError

@@ -25,7 +25,7 @@ from sparklod_cli.images.metrics import MOST_PSNR, on_background
 from sparklod_cli.lod.budget import parse_budgets
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.render.settings import RenderSettings
+from sparklod_cli.render.render_settings import RenderSettings
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.viewers.scenes import Scenes, read_scenes

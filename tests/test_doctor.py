@@ -14,7 +14,7 @@ import pytest
 from sparklod_cli import warmup
 from sparklod_cli.commands import doctor
 from sparklod_cli.commands.doctor import Check, check_all
-from sparklod_cli.render.gl import context
+from sparklod_cli.render import opengl
 from sparklod_cli.system import jit, machine
 from sparklod_cli.system.packages import Required, install_hint, pip_install
 
@@ -163,7 +163,7 @@ def test_little_memory_is_a_note(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("broken", [(), ("osmesa",), ("egl",), ("osmesa", "egl")])
 def test_one_opengl_is_enough(broken: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "_is_installed", lambda package: True)
-    monkeypatch.setattr(context, "probe", lambda kind: "no library" if kind in broken else "")
+    monkeypatch.setattr(opengl, "probe", lambda kind: "no library" if kind in broken else "")
     (check,) = doctor._opengl()
     assert check.state == ("note" if len(broken) == 2 else "ok")
     assert ("libosmesa6" in check.advice) == (len(broken) == 2)

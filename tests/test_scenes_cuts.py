@@ -17,9 +17,9 @@ from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.gaussian import moved
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.render.color_by import values_of
+from sparklod_cli.render.color_scales import values_of
+from sparklod_cli.render.render_settings import RenderSettings
 from sparklod_cli.render.renderer import Renderer
-from sparklod_cli.render.settings import RenderSettings
 from sparklod_cli.system.errors import FormatError, InvalidSplatsError
 from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings

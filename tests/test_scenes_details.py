@@ -15,7 +15,7 @@ from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.render.color_by import numbers_of, scale_of_splats
+from sparklod_cli.render.color_scales import numbers_of, scale_of_splats
 from sparklod_cli.viewers.playcanvas import LoadedDetail
 from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import PLAYCANVAS_BUDGET, DetailRule, LodSettings

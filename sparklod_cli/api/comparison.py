@@ -15,8 +15,8 @@ from ..codecs.formats import PRECISIONS
 from ..images import metrics
 from ..lod.budget import Budget
 from ..render.rasterizer import Image
+from ..render.render_settings import RenderSettings
 from ..render.renderer import Renderer
-from ..render.settings import RenderSettings
 from ..system.errors import SparklodError, memory_errors_translated
 from ..system.output import check_writable, write_file
 from ..system.progress import Progress, silent

@@ -11,10 +11,10 @@ from ..viewers.scenes import CutFinder
 
 if TYPE_CHECKING:
     from ..cameras.sources import CameraPath
-    from ..images.output import PictureOutput
+    from ..images.picture_files import PictureOutput
     from ..images.sequence import PictureSettings, WrittenPictures
     from ..lod.budget import Budget
-    from ..render.settings import RenderSettings
+    from ..render.render_settings import RenderSettings
     from ..simulation.results import FrameOutputs, Summary
     from ..tables.assertions import Assertion, Outcome
     from ..tables.columns import Filter, Row

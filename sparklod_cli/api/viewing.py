@@ -11,14 +11,13 @@ from ..cameras.camera_files import read_path
 from ..model.scene import common_axis
 from ..system.errors import NotSplatsError, SparklodError, memory_errors_translated
 from ..system.progress import Progress, silent
-from ..view.files import shown_files
 from ..view.server import LOOPBACK as LOOPBACK
 from ..view.server import Server as Server
+from ..view.shown_files import FOV, Point, extent_of, shown_files, start_of
 from ..view.site import Site as Site
 from ..view.site import check_folder as check_folder
 from ..view.site import export as export
 from ..view.site import from_cdn, from_folder, site_of
-from ..view.start import FOV, Point, extent_of, start_of
 
 
 def prepare(

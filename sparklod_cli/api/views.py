@@ -14,7 +14,7 @@ import numpy as np
 from ..cameras import DEFAULT_SIZE, ELEVATION
 from ..cameras.camera import MAX_FRAMES, Camera, Settings
 from ..cameras.camera_files import read_path, similarity
-from ..cameras.formats.table import FORMATS, Axes
+from ..cameras.camera_formats import FORMATS, Axes
 from ..cameras.sources import CameraPath
 from ..cameras.sources import orbit as orbit_cameras
 from ..codecs.formats import PRECISIONS
@@ -22,8 +22,8 @@ from ..images import metrics
 from ..model.instances import Instance, names_of
 from ..model.scene import DetailScene, Scene
 from ..render.rasterizer import Image
+from ..render.render_settings import RenderSettings
 from ..render.renderer import Renderer
-from ..render.settings import RenderSettings
 from ..system.errors import CameraPathError, FormatError, memory_errors_translated
 from ..system.threads import on_threads, thread_count
 from ..tables.notebook_table import Table

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..cameras.formats.table import NAMES
+from ..cameras.camera_formats import NAMES
 from ..io.local_files import companions
 from ..io.opening import file_of, readable
 from ..io.reading import Source, placement_of, places_of

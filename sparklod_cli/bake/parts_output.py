@@ -23,7 +23,7 @@ from ..render.kernels.ellipse import Limits
 from ..render.kernels.project import TILE, ShadedColumns
 from ..render.kernels.region_errors import compare_levels
 from ..render.kernels.shade import add_sh
-from ..render.settings import BLUR, CLIP
+from ..render.render_settings import BLUR, CLIP
 from ..system.output import Output
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads

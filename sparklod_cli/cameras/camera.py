@@ -13,7 +13,7 @@ from ..model.gaussian import rotation_matrix
 from ..model.scene import ASSUMED, AXES
 from ..system.errors import CameraPathError
 from . import DEFAULT_SIZE
-from .formats.table import Axes
+from .camera_formats import Axes
 
 Matrix = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ import numpy as np
 from ..io.local_files import read_text, read_together
 from ..system.errors import CameraPathError, SparklodError
 from ..system.untrusted import Origin, parse_json
+from . import sparklod_paths
 from .camera import Matrix, Settings, rigid
-from .formats import own
-from .formats.parsing import CameraJson, Files, Parsed, finite
-from .formats.table import FORMATS, NAMES, PathFormat
+from .camera_formats import FORMATS, NAMES, PathFormat
+from .camera_json import CameraJson, Files, Parsed, finite
 from .sources import CameraPath, cameras_of
 
 #: Bytes of a camera path's file. COLMAP's images.txt has all points that its images see.
@@ -47,7 +47,7 @@ def read(files: Files, *, format: str | None = None, settings: Settings | None =
 
 def _known(files: Files) -> PathFormat:
     form = next((form for form in FORMATS if _function(form, "recognises")(files)), None)
-    if form is None and own.resembles_csv(files):
+    if form is None and sparklod_paths.resembles_csv(files):
         form = next(form for form in FORMATS if form.name == "csv")  # whose error names the missing columns
     if form is None:
         names = ", ".join(form.name for form in FORMATS)
@@ -56,7 +56,7 @@ def _known(files: Files) -> PathFormat:
 
 
 def _function(form: PathFormat, verb: str) -> Any:
-    module = import_module(f".formats.{form.module}", __package__)
+    module = import_module(f".{form.module}", __package__)
     return getattr(module, f"{verb}_{form.name.replace('-', '_')}")
 
 

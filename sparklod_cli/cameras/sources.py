@@ -35,7 +35,7 @@ from .camera import (
     rigid,
     to_opengl,
 )
-from .formats.table import Axes
+from .camera_formats import Axes
 
 if TYPE_CHECKING:
     from .framing import Balls

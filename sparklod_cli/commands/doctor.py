@@ -231,7 +231,7 @@ def _opengl() -> Iterator[Check]:
     if not _is_installed("moderngl"):
         yield Check("OpenGL", "note", "not tried without moderngl", install_hint("render", package="moderngl"))
         return
-    from ..render.gl.context import PACKAGES, probe
+    from ..render.opengl import PACKAGES, probe
 
     reasons = {kind: probe(kind) for kind in PACKAGES}
     value = ", ".join(f"{kind} draws" if not reason else f"{kind}: {reason}" for kind, reason in reasons.items())
@@ -245,8 +245,8 @@ def _open3d() -> Iterator[Check]:
         yield Check("Open3D", "note", "not tried, since it is not installed", install_hint("render", package="open3d"))
         return
     try:
-        from ..render.open3d.backend import command
-        from ..render.open3d.child import PACKAGES
+        from ..render.open3d_backend import command
+        from ..render.open3d_process import PACKAGES
     except ImportError as absent:  # numpy
         yield Check("Open3D", "note", f"not tried ({absent})", install_hint())
         return

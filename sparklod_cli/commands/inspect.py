@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ..images.output import PLOT_BY
+from ..images.picture_files import PLOT_BY
 from ..system.errors import CHECK_FAILED, OutOfMemoryError, SparklodError, StdoutError, memory_errors_translated
 from ..system.output import write_file
 from ..system.setting_fields import setting, whole

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ..codecs.formats import ROUND_TRIPS
-from ..images.output import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from ..images.picture_files import JPEG_QUALITY, MOVING, STILL, THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from ..lod.budget import Budget, doubt, parse_budgets
 from ..model import MAX_SH_DEGREE
-from ..render.settings import SORTINGS, RenderSettings, uses_card
+from ..render.render_settings import SORTINGS, RenderSettings, uses_card
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import format_size, parse_time
 from ..viewers.viewer_settings import BLEND, StreamingSettings
@@ -41,7 +41,7 @@ from .rules import check, is_set
 if TYPE_CHECKING:
     from ..api.comparison import BudgetSummary
     from ..cameras.sources import CameraPath
-    from ..images.output import PictureOutput
+    from ..images.picture_files import PictureOutput
     from ..images.pixels import Color
     from ..images.sequence import PictureSettings, WrittenPictures
     from ..model.instances import Instance
@@ -326,7 +326,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
 
 def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> PictureOutput:
     """Return the output of the pictures of some cameras; one without a name goes beside the first input."""
-    from ..images.output import output_for
+    from ..images.picture_files import output_for
 
     first = options.inputs.scene or options.inputs.files[0]
     named, folder = (
@@ -348,7 +348,7 @@ def _place(
     ctx: click.Context, options: RenderOptions, instances: list[Instance], path: CameraPath
 ) -> tuple[PictureOutput, PictureSettings]:
     """Return the output of the pictures of a path, and how they become files; refuse it before work goes into it."""
-    from ..images.output import WITH_ALPHA
+    from ..images.picture_files import WITH_ALPHA
     from ..images.pixels import check_animation, scale_width
     from ..images.sequence import PictureSettings, frame_rate
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images.output import PLOT_BY
+from ..images.picture_files import PLOT_BY
 from ..images.pixels import BACKGROUND
 from ..lod.kernels.tree_links import find_depths
 from ..lod.tree_settings import DEFAULT_BASE

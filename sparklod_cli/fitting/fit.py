@@ -12,7 +12,7 @@ import numpy as np
 
 from ..model.lod_tree import LodTree
 from ..model.splats import Splats
-from ..render.settings import RasterSettings, uses_card
+from ..render.render_settings import RasterSettings, uses_card
 from ..system.errors import BackendError
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads

@@ -24,7 +24,7 @@ from ..model.splats import FloatArray, Splats
 from ..render import gradients, rasterizer
 from ..render.kernels.shade import add_sh
 from ..render.rasterizer import Image, ShadedSplats, draw
-from ..render.settings import RasterSettings
+from ..render.render_settings import RasterSettings
 from ..viewers.cut import Forest, TreeInstance
 from ..viewers.loaded_scene import nodes_of
 from ..viewers.spark import SparkViewer

@@ -20,7 +20,7 @@ from PIL import ImageDraw, ImageFont
 
 from ..system.errors import SparklodError, optional_import
 from ..system.untrusted import printable
-from .output import JPEG_QUALITY
+from .picture_files import JPEG_QUALITY
 
 if TYPE_CHECKING:
     from ..render.color_scales import Coloring

@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..cameras.camera import DEFAULT_FPS
+from ..render.render_settings import OF_PIXELS
 from ..render.renderer import DrawnPicture, Renderer
-from ..render.settings import OF_PIXELS
 from ..system.output import write_file
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from ..system.threads import on_threads, ordered_map
 from . import pixels as codes
-from .output import JPEG_QUALITY
+from .picture_files import JPEG_QUALITY
 from .pixels import animate
 
 if TYPE_CHECKING:
     from ..cameras.sources import CameraPath
-    from ..render.settings import RenderSettings
+    from ..render.render_settings import RenderSettings
     from ..viewers.scenes import CutFinder
-    from .output import PictureOutput
+    from .picture_files import PictureOutput
     from .pixels import Color, Pixels
 
 #: Maximum total number of pixels of the pictures that are cached after finding a gain until their frames are written:

@@ -15,7 +15,7 @@ from .kernels import backward
 from .kernels.backward import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
 from .kernels.shade import sh_gradients
 from .rasterizer import Image, ShadedSplats
-from .settings import RasterSettings
+from .render_settings import RasterSettings
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..model.splats import FloatArray, Splats
 from ..system.threads import threads_in_use
 from .kernels import ellipse, project, raster
 from .kernels.shade import add_sh
-from .settings import BLUR, CLIP, RasterSettings
+from .render_settings import BLUR, CLIP, RasterSettings
 
 
 @dataclass(frozen=True)

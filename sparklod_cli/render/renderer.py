@@ -19,7 +19,7 @@ from ..viewers.scenes import Cut, CutFinder
 from . import rasterizer
 from .kernels.raster import count_fragments, draw_discs
 from .rasterizer import Image, ShadedSplats, shade
-from .settings import CLIP, RasterSettings, RenderSettings, uses_card
+from .render_settings import CLIP, RasterSettings, RenderSettings, uses_card
 
 if TYPE_CHECKING:
     from .color_scales import Coloring
@@ -27,7 +27,12 @@ if TYPE_CHECKING:
 #: The device that draws instead of the backend numba where a card is used, and modules of all that draw: each has a
 #: function `draw`.
 ON_CARD = "cuda"
-MODULES = {"numba": ".rasterizer", ON_CARD: ".cuda.rasterizer", "osmesa": ".gl.osmesa", "open3d": ".open3d.backend"}
+MODULES = {
+    "numba": ".rasterizer",
+    ON_CARD: ".cuda.card_rasterizer",
+    "osmesa": ".osmesa",
+    "open3d": ".open3d_backend",
+}
 
 #: Held while kernels run on all threads: they do not share them, and not every layer of threads survives their trying.
 _KERNELS = threading.Lock()
@@ -77,14 +82,14 @@ class Renderer:
         self.scale = None if by is None else self._scale(by, cameras, progress)
 
     def _scale(self, by: str, cameras: Sequence[Camera], progress: Progress) -> Coloring:
-        from . import color_by
+        from . import color_scales
 
         if by == "depth":
-            return color_by.scale_of_depth(self.source, cameras, self.settings.raster)
+            return color_scales.scale_of_depth(self.source, cameras, self.settings.raster)
         if by == "overdraw":
             some = {number: cameras[number] for number in (0, len(cameras) // 2, len(cameras) - 1)}
-            return color_by.scale_of_overdraw([self._overdraw(self.source.cut(at), at) for at in some.values()])
-        return color_by.scale_of_splats(by, self.source, cameras, progress)
+            return color_scales.scale_of_overdraw([self._overdraw(self.source.cut(at), at) for at in some.values()])
+        return color_scales.scale_of_splats(by, self.source, cameras, progress)
 
     def draw(self, camera: Camera) -> DrawnPicture:
         """Draw the picture of a camera; raise `BackendError` if the backend cannot draw here."""
@@ -100,7 +105,7 @@ class Renderer:
             if by == "depth":
                 shaded, top = colored_by_depth(shaded, fine, self.settings.raster)
             elif self.scale is not None and by is not None:
-                from .color_by import values_of
+                from .color_scales import values_of
 
                 values = np.concatenate([values_of(by, part) for part in cut.parts])
                 shaded = replace(shaded, rgb=self.scale.rgb(values) / np.float32(255))

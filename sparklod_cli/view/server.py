@@ -22,7 +22,7 @@ from urllib.parse import unquote_to_bytes
 from .. import __version__
 from ..io.local_files import open_plain
 from ..system.errors import SparklodError
-from .files import media_type
+from .shown_files import media_type
 from .site import CAMERAS, INDEX, MAX_BYTES, Site, parse_drop
 
 #: Default address of a server: only programs of this machine can connect.

@@ -24,8 +24,8 @@ from typing import Any
 from .. import __version__
 from ..cameras.camera import Settings as CameraSettings
 from ..cameras.camera_files import read
-from ..cameras.formats.parsing import Files
-from ..cameras.formats.table import NAMES
+from ..cameras.camera_formats import NAMES
+from ..cameras.camera_json import Files
 from ..cameras.sources import CameraPath
 from ..io.local_files import leads_away, open_plain, read_text
 from ..model.scene import up_notes_of
@@ -33,8 +33,7 @@ from ..system.errors import CameraPathError, OutputError, SparklodError, reason_
 from ..system.output import try_place, write_file
 from ..system.progress import Progress, silent
 from ..system.untrusted import parse_json, printable, quoted_value
-from .files import ENGINES, Resources, ShownFile
-from .start import Extent, Start
+from .shown_files import ENGINES, Extent, Resources, ShownFile, Start
 
 SPARK, PLAYCANVAS, CESIUM, THREE = "@sparkjsdev/spark", "playcanvas", "cesium", "three"
 

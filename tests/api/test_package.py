@@ -35,7 +35,7 @@ def test_every_public_name_exists_and_is_typed() -> None:
 
 
 def test_functions_stay_where_modules_have_their_names() -> None:
-    code = "import sparklod_cli as s; import sparklod_cli.render.settings; print(s.render)"
+    code = "import sparklod_cli as s; import sparklod_cli.render.render_settings; print(s.render)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.startswith("<function ")
 

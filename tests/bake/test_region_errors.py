@@ -17,7 +17,7 @@ from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.rasterizer import shade
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 
 
 def cloud(count: int, seed: int, sh_degree: int = 1) -> Splats:

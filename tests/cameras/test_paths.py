@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sparklod_cli.cameras import sources
 from sparklod_cli.cameras.camera import DEFAULT_UP, Camera, Frame, Intrinsics, Settings, camera_of, look_at
 from sparklod_cli.cameras.camera_files import read
-from sparklod_cli.cameras.formats.table import Axes
+from sparklod_cli.cameras.camera_formats import Axes
 from sparklod_cli.cameras.framing import (
     FILLED,
     OUTSIDE,
@@ -37,7 +37,7 @@ from sparklod_cli.cameras.sources import (
     hermite,
 )
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.system.errors import CameraPathError, InvalidSplatsError
 from tests.cameras.known import (
     FOCAL,

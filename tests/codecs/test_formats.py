@@ -88,7 +88,7 @@ def test_tables_load_nothing_heavy() -> None:
     """`--help` names what stands in them."""
     program = (
         "import sys; from sparklod_cli.codecs import formats;"
-        "from sparklod_cli.tables import columns; from sparklod_cli.cameras.formats import table;"
+        "from sparklod_cli.tables import columns; from sparklod_cli.cameras import camera_formats as table;"
         "assert not {'numpy', 'numba'} & set(sys.modules), 'heavy'"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

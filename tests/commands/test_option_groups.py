@@ -14,7 +14,7 @@ from sparklod_cli.codecs.options import RadOptions, SogOptions, WriteOptions
 from sparklod_cli.commands.command import Option
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod.tree_settings import DetailSettings
-from sparklod_cli.render.settings import RasterSettings, RenderSettings
+from sparklod_cli.render.render_settings import RasterSettings, RenderSettings
 from sparklod_cli.system.setting_fields import CheckedSettings, Range, Setting, setting, settings_in
 from sparklod_cli.viewers.viewer_settings import DetailRule, LodSettings, Network, StreamingSettings
 from tests.conftest import Capture

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cameras import camera
-from sparklod_cli.cameras.formats.table import PLAYCANVAS
+from sparklod_cli.cameras.camera_formats import PLAYCANVAS
 from sparklod_cli.codecs import compression
 from sparklod_cli.inspection import tree
 from sparklod_cli.io import local_files

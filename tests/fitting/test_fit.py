@@ -21,7 +21,7 @@ from sparklod_cli.inspection.tree import examine
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 

@@ -10,7 +10,7 @@ from sparklod_cli.fitting.kernels.adam import MOST_D, Rates
 from sparklod_cli.fitting.pictures import FittedNodes, FullDetailPicture, Optimiser, Place, pictures, placed
 from sparklod_cli.lod import quality
 from sparklod_cli.render.rasterizer import draw
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.scenes import random_splats
 
 COUNT = 2000

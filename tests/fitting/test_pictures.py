@@ -10,7 +10,7 @@ from sparklod_cli.fitting.pictures import FittedNodes, Place, keep_gains, keep_s
 from sparklod_cli.fitting.settings import SHARES
 from sparklod_cli.inspection.tree import examine
 from sparklod_cli.lod import quality
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.scenes import random_splats
 
 COUNT = 3000

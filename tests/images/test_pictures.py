@@ -20,13 +20,13 @@ from PIL import Image, ImageDraw, ImageSequence
 from sparklod_cli.cameras.camera import Settings
 from sparklod_cli.cameras.sources import CameraPath, single_views
 from sparklod_cli.images import pixels, sequence
-from sparklod_cli.images.output import output_for
+from sparklod_cli.images.picture_files import output_for
 from sparklod_cli.images.pixels import cells, check_animation, grid, sheet
 from sparklod_cli.images.sequence import PictureSettings, WrittenPictures, write_pictures
 from sparklod_cli.model.instances import instances_of
 from sparklod_cli.render.color_scales import VIRIDIS, smooth
+from sparklod_cli.render.render_settings import RenderSettings
 from sparklod_cli.render.renderer import DrawnPicture, Renderer, averaged, finer
-from sparklod_cli.render.settings import RenderSettings
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.packages import install_hint
 from sparklod_cli.viewers.scenes import CutFinder, read_scenes

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.interop.node import Node
 
 PROGRAM = Path(__file__).with_name("spark_page.mjs")

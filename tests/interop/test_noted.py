@@ -13,7 +13,7 @@ from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.interop.foreign import Foreign
 from tests.interop.page import Page
 from tests.interop.pictures import cameras_around

@@ -17,7 +17,7 @@ from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import draw, shade
-from sparklod_cli.render.settings import SORTS, RasterSettings
+from sparklod_cli.render.render_settings import SORTS, RasterSettings
 from tests.conftest import FIXTURES
 from tests.interop.page import Page
 from tests.interop.pictures import Difference, cameras_around, compare, psnr

@@ -21,7 +21,7 @@ from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.conftest import FIXTURES
 from tests.interop.page import Page, Picture, Request
 from tests.interop.pictures import cameras_around

@@ -10,7 +10,7 @@ from sparklod_cli.cli import run
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.fittings import StandIn
 from tests.fittings import stand_in as stand_in
 from tests.interop.page import Page

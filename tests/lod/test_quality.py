@@ -25,7 +25,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import Image, draw, shade
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.viewers.cut import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from tests.conftest import real_scene

@@ -17,7 +17,7 @@ from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import LARGEST, ROWS, Transform, sh_basis, sh_rotations
 from sparklod_cli.render.rasterizer import Image, draw, shade
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.references.gaussians import covariance as reference_covariance
 from tests.references.gaussians import rotation_matrix
 from tests.references.spark_pictures import spherical_harmonics

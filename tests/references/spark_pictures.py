@@ -10,7 +10,7 @@ import numpy as np
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import ShadedSplats
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.references.gaussians import covariance
 
 

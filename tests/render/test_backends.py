@@ -23,12 +23,11 @@ from sparklod_cli.codecs.gpu import data_texture
 from sparklod_cli.figures.pyvista_scene import load_pyvista
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.falloff import MIN_ALPHA
-from sparklod_cli.render import rasterizer, settings
-from sparklod_cli.render.gl import context, osmesa
-from sparklod_cli.render.open3d import backend
-from sparklod_cli.render.open3d.child import PIECE
+from sparklod_cli.render import open3d_backend as backend
+from sparklod_cli.render import opengl, osmesa, rasterizer
+from sparklod_cli.render.open3d_process import PIECE
 from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade
-from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
+from sparklod_cli.render.render_settings import PROFILES, SORTINGS, SORTS, RasterSettings
 from sparklod_cli.system.errors import BackendError, SparklodError
 from sparklod_cli.system.packages import install_hint
 from tests.conftest import FIXTURES, ROOT
@@ -47,7 +46,7 @@ FLOAT, HALF = 80, 45
 
 
 @pytest.fixture(scope="module")
-def opengl() -> None:
+def working_opengl() -> None:
     """Skips where neither libOSMesa nor EGL draws."""
     try:
         osmesa.on_gl_thread(osmesa.open_context)
@@ -55,7 +54,7 @@ def opengl() -> None:
         pytest.skip(str(error))
 
 
-needs_opengl = pytest.mark.usefixtures("opengl")
+needs_opengl = pytest.mark.usefixtures("working_opengl")
 
 
 def camera(
@@ -162,7 +161,7 @@ def test_one_splat_is_the_gaussian_of_the_textbook(precision: str) -> None:
 
 @needs_opengl
 @pytest.mark.parametrize("precision", osmesa.PRECISIONS)
-@pytest.mark.parametrize("sorting", settings.SORTINGS)
+@pytest.mark.parametrize("sorting", SORTINGS)
 @pytest.mark.parametrize("throttle", [0.0, 0.01])
 def test_a_picture_of_no_splats_is_empty(precision: str, sorting: str, throttle: float) -> None:
     options = {"precision": precision, "sorting": sorting, "throttle": throttle}
@@ -181,7 +180,7 @@ def test_broken_splats_are_not_drawn() -> None:
 
 
 @needs_opengl
-@pytest.mark.parametrize("sorting", settings.SORTINGS)
+@pytest.mark.parametrize("sorting", SORTINGS)
 def test_of_equally_distant_splats_the_last_is_in_front(sorting: str) -> None:
     both = joined(orange(d=1), one((0, 0, 0), 0.1, 0.5, (0, 1, 0)))
     assert_agrees(both, CAMERAS["front"], sorting=sorting)
@@ -286,9 +285,9 @@ def child(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
 DRAW_ONE = """
 import numpy as np
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.render.gl import osmesa
+from sparklod_cli.render import osmesa
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.render.rasterizer import ShadedSplats
 rows = [[0, 0, -5]], [[0.1] * 3], [[0, 0, 0, 1]], [0.5], [[1, 1, 1]]
 shown = ShadedSplats(*(np.array(row, np.float32) for row in rows))
@@ -299,11 +298,11 @@ except SparklodError as error:
 """
 
 
-@pytest.mark.parametrize("kind", context.PACKAGES)
+@pytest.mark.parametrize("kind", opengl.PACKAGES)
 def test_either_opengl_library_is_enough(kind: str) -> None:
-    if reason := context.probe(kind):
-        pytest.skip(f"no OpenGL by {kind} (on Debian and Ubuntu: apt install {context.PACKAGES[kind]}): {reason}")
-    only = f"from sparklod_cli.render.gl import context\ncontext.PACKAGES = {{{kind!r}: ''}}\n"
+    if reason := opengl.probe(kind):
+        pytest.skip(f"no OpenGL by {kind} (on Debian and Ubuntu: apt install {opengl.PACKAGES[kind]}): {reason}")
+    only = f"from sparklod_cli.render import opengl\ncontext.PACKAGES = {{{kind!r}: ''}}\n"
     done = child(only + DRAW_ONE)
     assert float(done.stdout) == pytest.approx(0.5 * 400 / 400.3, abs=1e-5), done.stderr
 
@@ -311,7 +310,7 @@ def test_either_opengl_library_is_enough(kind: str) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="libraries are hidden as Linux finds them")
 def test_missing_libraries_are_named(tmp_path: Path) -> None:
     pytest.importorskip("moderngl")
-    for name in (*context.OSMESA_NAMES, "libEGL.so", "libEGL.so.1"):
+    for name in (*opengl.OSMESA_NAMES, "libEGL.so", "libEGL.so.1"):
         (tmp_path / name).write_bytes(b"")
     done = child(DRAW_ONE, LD_LIBRARY_PATH=str(tmp_path))
     assert done.returncode == 0, done.stderr
@@ -331,7 +330,7 @@ def test_a_driver_that_crashes_is_no_crash_here(monkeypatch: pytest.MonkeyPatch,
     python.write_text("#!/bin/sh\nkill -SEGV $$\n")
     python.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(python))
-    assert context.probe.__wrapped__("osmesa") == "the driver ended the test process by signal 11"
+    assert opengl.probe.__wrapped__("osmesa") == "the driver ended the test process by signal 11"
 
 
 def test_a_forked_process_gets_no_opengl(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -507,7 +506,7 @@ def test_open3d_draws_nothing_where_no_splat_is() -> None:
 PREAMBLE = """
 import os, sys, time
 import numpy as np
-from sparklod_cli.render.open3d.child import send, receive
+from sparklod_cli.render.open3d_process import send, receive
 inn, out = sys.stdin.buffer, sys.stdout.buffer
 """
 
@@ -543,7 +542,7 @@ from types import SimpleNamespace as Space
 rendering = Space(MaterialRecord=lambda: Space())
 sys.modules["open3d"] = Space(__version__="0.19.0", visualization=Space(rendering=rendering))
 """
-RUNS = "from sparklod_cli.render.open3d.child import main; main()"
+RUNS = "from sparklod_cli.render.open3d_process import main; main()"
 
 
 @pytest.mark.parametrize(
@@ -612,7 +611,7 @@ def test_an_old_mesa_gets_small_pieces(play: Callable[[str], None]) -> None:
 def test_the_process_ends_with_its_parent() -> None:
     program = f"""
     import sys
-    from sparklod_cli.render.open3d import backend
+    from sparklod_cli.render import open3d_backend as backend
     backend.command = lambda: [sys.executable, "-c", {PREAMBLE + NUMBER!r}]
     print(backend.Child()._process.pid, "open3d" in sys.modules)
     """

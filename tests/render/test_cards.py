@@ -13,7 +13,7 @@ from sparklod_cli.render import gradients as on_processor
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.kernels.backward import CENTER, LOD_OPACITY, LOG_SCALE, RGB, TURN
 from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade
-from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
+from sparklod_cli.render.render_settings import PROFILES, SORTS, RasterSettings
 from tests.cards import MARKS
 from tests.render.drawables import psnr, shown
 
@@ -24,7 +24,7 @@ LEAST = 60
 
 
 def draw_on_a_card(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Image:
-    from sparklod_cli.render.cuda.rasterizer import draw  # loads numba's cuda
+    from sparklod_cli.render.cuda.card_rasterizer import draw  # loads numba's cuda
 
     return draw(splats, camera, settings)
 
@@ -84,7 +84,7 @@ def test_a_device_of_settings_is_where_the_reference_draws() -> None:
 @pytest.mark.parametrize("degree", [1, 3])
 def test_uploaded_splats_are_shaded_on_the_card(degree: int) -> None:
     from sparklod_cli.render.cuda.card import to_card
-    from sparklod_cli.render.cuda.rasterizer import CardSplats, CardView, draw_on_card
+    from sparklod_cli.render.cuda.card_rasterizer import CardSplats, CardView, draw_on_card
 
     splats, camera, settings = splats_of(30, degree), camera_at(), RasterSettings()
     some = np.arange(5, 30, dtype=np.int32)
@@ -111,7 +111,7 @@ MOST = 1e-3
 def test_gradients_are_those_of_the_processor() -> None:
     from sparklod_cli.render.cuda.backward import BATCH, gradients_on_card
     from sparklod_cli.render.cuda.card import to_card
-    from sparklod_cli.render.cuda.rasterizer import CardSplats, CardView, draw_on_card
+    from sparklod_cli.render.cuda.card_rasterizer import CardSplats, CardView, draw_on_card
 
     splats, camera, settings = splats_of(40), camera_at(size=(18, 10)), RasterSettings(max_radius=25.0)
     by_image = np.random.default_rng(1).normal(size=(camera.height, camera.width, 4)).astype(np.float32)

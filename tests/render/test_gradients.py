@@ -18,7 +18,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.gradients import SplatGradients, by_sh, draw
 from sparklod_cli.render.rasterizer import ShadedSplats, shade
-from sparklod_cli.render.settings import SORTS, RasterSettings
+from sparklod_cli.render.render_settings import SORTS, RasterSettings
 from sparklod_cli.system.threads import on_threads
 from tests.references import spark_pictures
 from tests.render.drawables import camera_at, joined, one, rows, shown

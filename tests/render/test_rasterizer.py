@@ -25,7 +25,7 @@ from sparklod_cli.render.rasterizer import (
     sort_into_tiles,
     tiles_across,
 )
-from sparklod_cli.render.settings import PROFILES, SORTS, RasterSettings
+from sparklod_cli.render.render_settings import PROFILES, SORTS, RasterSettings
 from sparklod_cli.system.threads import on_threads
 from tests.references import spark_pictures
 from tests.render.drawables import COLUMNS, camera_at, joined, one, rows, shown

@@ -20,8 +20,8 @@ from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.render.color_scales import nice_step, ticks
 from sparklod_cli.render.cuda.card import card_errors, on_card
 from sparklod_cli.render.rasterizer import draw, shade
+from sparklod_cli.render.render_settings import COLOR_BY, DEVICES, STYLES, RasterSettings, RenderSettings, uses_card
 from sparklod_cli.render.renderer import BILLBOARD_ALPHA, DrawnPicture, Renderer
-from sparklod_cli.render.settings import COLOR_BY, DEVICES, STYLES, RasterSettings, RenderSettings, uses_card
 from sparklod_cli.system.errors import BackendError, SparklodError
 from sparklod_cli.viewers.scenes import CutFinder
 from tests.cards import MISSING

@@ -198,7 +198,7 @@ def test_a_part_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypa
 #: process of Open3D says, a line in the settings of a shell.
 WRITERS = {
     *("system/output.py", "system/addresses.py"),
-    *("render/open3d/backend.py", "commands/completion.py"),
+    *("render/open3d_backend.py", "commands/completion.py"),
 }
 
 

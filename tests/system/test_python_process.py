@@ -27,9 +27,9 @@ PLANTED = (
 
 def probe_opengl() -> None:
     pytest.importorskip("moderngl")
-    from sparklod_cli.render.gl import context
+    from sparklod_cli.render import opengl
 
-    context.probe.__wrapped__("osmesa")
+    opengl.probe.__wrapped__("osmesa")
 
 
 def probe_pyvista() -> None:
@@ -41,7 +41,7 @@ def probe_pyvista() -> None:
 
 def start_open3d() -> None:
     pytest.importorskip("open3d")
-    from sparklod_cli.render.open3d import backend
+    from sparklod_cli.render import open3d_backend as backend
 
     backend.Child().close()
 
@@ -82,8 +82,8 @@ STARTED: dict[str, list[Callable[[], object]]] = {
     "bake/out_of_core/cluster": [start_workers],
     "commands/doctor": [check_kernels, find_ffmpeg],
     "figures/pyvista_scene": [probe_pyvista],
-    "render/gl/context": [probe_opengl],
-    "render/open3d/backend": [start_open3d],
+    "render/opengl": [probe_opengl],
+    "render/open3d_backend": [start_open3d],
     "warmup": [start_warmup, import_numba_without_forks],
 }
 

@@ -30,7 +30,7 @@ from sparklod_cli.model.instances import instances_of
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import CameraPathError, FormatError, OutputError, SparklodError
 from sparklod_cli.view import site as exporting
-from sparklod_cli.view.files import shown_files
+from sparklod_cli.view.shown_files import shown_files
 from sparklod_cli.view.site import (
     LICENSES,
     MODULES,

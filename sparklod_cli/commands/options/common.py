@@ -91,7 +91,7 @@ def table_output(
         raise click.UsageError(f"{flag} {output}: tables are written as {', '.join(f'.{form}' for form in FORMS)}")
     if suffix and form is not None:
         from ...codecs.formats import FORMATS
-        from ...images.output import MOVING, STILL, SUFFIXES
+        from ...images.picture_files import MOVING, STILL, SUFFIXES
 
         of_splats = (suffix for each in FORMATS for suffix in each.suffixes)
         others = {*FORMS, *STILL, *MOVING, *SUFFIXES, "html", "npz"}

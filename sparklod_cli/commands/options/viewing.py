@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ...cameras import DEFAULT_SIZE, ELEVATION, ORBIT
-from ...cameras.formats.table import FORMATS, Axes
+from ...cameras.camera_formats import FORMATS, Axes
 from ...codecs.formats import PRECISIONS
 from ...lod.budget import LARGEST, Budget, parse_budgets
 from ...model.foveation import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE, Cones, Foveation, Frustum
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ...cameras.camera import Matrix
     from ...cameras.sources import CameraPath
     from ...model.instances import Instance
-    from ...render.settings import RenderSettings
+    from ...render.render_settings import RenderSettings
     from ...viewers.scenes import Scenes
     from ..console import Console
 

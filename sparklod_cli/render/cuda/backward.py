@@ -49,8 +49,8 @@ from ..kernels.project import (
 )
 from ..kernels.raster import OPAQUE
 from .card import CardArray
+from .card_rasterizer import CardPicture, CardSplats, CardView
 from .forward import PIXELS, lens_of, limits_of, pixel_of
-from .rasterizer import CardPicture, CardSplats, CardView
 
 f32, f64 = np.float32, np.float64
 

@@ -21,7 +21,7 @@ from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.render import renderer
 from sparklod_cli.render.rasterizer import Image, ShadedSplats
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.conftest import FIXTURES, Capture
 from tests.lod.details import row_of_regions
 from tests.part_files import tiled, write_streamed

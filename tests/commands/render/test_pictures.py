@@ -12,7 +12,7 @@ import pytest
 
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.render import settings
-from sparklod_cli.render.settings import BACKENDS
+from sparklod_cli.render.render_settings import BACKENDS
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, floats, pixels, render
 from tests.conftest import FIXTURES, Capture
 

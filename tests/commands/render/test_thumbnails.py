@@ -18,7 +18,7 @@ from PIL import Image
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import ROUND_TRIPS
 from sparklod_cli.images.metrics import psnr
-from sparklod_cli.images.output import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
+from sparklod_cli.images.picture_files import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from sparklod_cli.viewers import scenes
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, floats, pixels, render
 from tests.conftest import ROOT, Capture

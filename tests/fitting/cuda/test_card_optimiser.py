@@ -9,7 +9,7 @@ from sparklod_cli.fitting.fit import RATES, fit
 from sparklod_cli.fitting.pictures import FittedNodes, FittedSet, Optimiser, Place, pictures, placed
 from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod import quality
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.cards import MARKS
 from tests.scenes import random_splats
 

@@ -15,7 +15,7 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.gaussian import rotation_matrices
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import ShadedSplats, draw, shade, world_to_camera
-from sparklod_cli.render.settings import RasterSettings
+from sparklod_cli.render.render_settings import RasterSettings
 from tests.interop.engines.browser import FAR, NEAR
 from tests.interop.pictures import psnr
 

@@ -12,11 +12,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...system.errors import CameraPathError
-from ...system.untrusted import quoted_value
-from ..camera import Frame, Intrinsics, Matrix, Numbers, Settings, frame_looking
-from ..sources import along, cardinal_tangents, hermite
-from .parsing import CameraJson, Files, Parsed
+from ..system.errors import CameraPathError
+from ..system.untrusted import quoted_value
+from .camera import Frame, Intrinsics, Matrix, Numbers, Settings, frame_looking
+from .camera_json import CameraJson, Files, Parsed
+from .sources import along, cardinal_tangents, hermite
 
 UP = (0.0, 1.0, 0.0)
 FRAME_RATE = 30.0

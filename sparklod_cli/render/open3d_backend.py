@@ -29,15 +29,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...cameras.camera import Camera
-from ...model.falloff import MAX_STD_DEV, MIN_ALPHA
-from ...model.gaussian import linear_opacity
-from ...model.sh import SH_C0
-from ...system.errors import BackendError
-from ...system.python_process import module_command
-from ..rasterizer import Image, ShadedSplats
-from ..settings import BLUR, CLIP, RasterSettings
-from .child import COLUMNS, PACKAGES, PIECE, TILE, Array, receive, send
+from ..cameras.camera import Camera
+from ..model.falloff import MAX_STD_DEV, MIN_ALPHA
+from ..model.gaussian import linear_opacity
+from ..model.sh import SH_C0
+from ..system.errors import BackendError
+from ..system.python_process import module_command
+from .open3d_process import COLUMNS, PACKAGES, PIECE, TILE, Array, receive, send
+from .rasterizer import Image, ShadedSplats
+from .render_settings import BLUR, CLIP, RasterSettings
 
 #: Left, top and side of a piece of the picture, pixels.
 Square = tuple[int, int, int]
@@ -163,7 +163,7 @@ MOST_ENTRIES, MOST_ENTRIES_OF_OLD_MESA, NEW_MESA = 1 << 25, 1 << 15, 25
 
 def command() -> list[str]:
     """Return the command line of the process in which Open3D draws."""
-    return module_command(f"{__package__}.child")
+    return module_command(f"{__package__}.open3d_process")
 
 
 class Child:

@@ -13,7 +13,7 @@ from ...model.sh import COEFFICIENTS
 from .. import rasterizer
 from ..kernels.project import COLUMNS
 from ..rasterizer import Image, ShadedSplats
-from ..settings import RasterSettings
+from ..render_settings import RasterSettings
 from . import forward
 from .card import CardArray, CardMemory, add_up, card_errors, find_card, on_card, sort, to_card
 

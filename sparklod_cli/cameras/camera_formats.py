@@ -53,8 +53,8 @@ class PathFormat(NamedTuple):
 
 #: The formats, in the order in which they are tried.
 FORMATS = (
-    PathFormat("sparklod", "sparklod's JSON", "own", Axes.OPENGL_C2W, looking=True),
-    PathFormat("csv", "sparklod's CSV", "own", Axes.OPENGL_C2W, looking=True),
+    PathFormat("sparklod", "sparklod's JSON", "sparklod_paths", Axes.OPENGL_C2W, looking=True),
+    PathFormat("csv", "sparklod's CSV", "sparklod_paths", Axes.OPENGL_C2W, looking=True),
     PathFormat(
         "nerfstudio",
         "nerfstudio's camera path",
@@ -65,8 +65,8 @@ FORMATS = (
     ),
     PathFormat("transforms", "transforms.json", "trainers", Axes.OPENGL_C2W, names=(("transforms.json",),)),
     PathFormat("inria", "Inria's cameras.json", "trainers", Axes.OPENCV_C2W, names=(("cameras.json",),)),
-    PathFormat("supersplat", "SuperSplat", "playcanvas", None, looking=True, world=PLAYCANVAS),
-    PathFormat("camera-track", "splat-transform's camera track", "playcanvas", None, looking=True, world=PLAYCANVAS),
+    PathFormat("supersplat", "SuperSplat", "supersplat", None, looking=True, world=PLAYCANVAS),
+    PathFormat("camera-track", "splat-transform's camera track", "supersplat", None, looking=True, world=PLAYCANVAS),
     PathFormat("open3d", "Open3D's camera trajectory", "trainers", Axes.OPENCV_W2C),
     PathFormat(
         "colmap",

@@ -13,7 +13,7 @@ import subprocess
 import sys
 from typing import Any
 
-from ...system.python_process import module_command
+from ..system.python_process import module_command
 
 #: OpenGL version that the shaders need: 4.2 introduced unpackHalf2x16.
 VERSION = 420

@@ -13,10 +13,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ...system import untrusted
-from ...system.errors import CameraPathError
-from ...system.untrusted import LARGEST, Origin, decoded_text, quoted_value
-from ..camera import Frame, Matrix, Numbers, pose, rotation_of
+from ..system import untrusted
+from ..system.errors import CameraPathError
+from ..system.untrusted import LARGEST, Origin, decoded_text, quoted_value
+from .camera import Frame, Matrix, Numbers, pose, rotation_of
 
 #: Most pixels along a side of an image.
 MAX_SIDE = 1 << 16

@@ -16,17 +16,17 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ...cameras.camera import Camera
-from ...codecs.gpu import data_texture
-from ...model.falloff import HALF_LOG2E, LEAST_EXPONENT, LEAST_REST, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
-from ...model.sh import COEFFICIENTS
-from ...model.splats import FloatArray, Splats
-from ...system.errors import BackendError, optional_import
-from ..kernels.ellipse import LEAST_COVARIANCE, MAX_D, MAX_VARIANCE
-from ..kernels.project import MAX_COLOR
-from ..rasterizer import Image, ShadedSplats, world_to_camera
-from ..settings import BLUR, CLIP, RasterSettings
-from . import context as contexts
+from ..cameras.camera import Camera
+from ..codecs.gpu import data_texture
+from ..model.falloff import HALF_LOG2E, LEAST_EXPONENT, LEAST_REST, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
+from ..model.sh import COEFFICIENTS
+from ..model.splats import FloatArray, Splats
+from ..system.errors import BackendError, optional_import
+from . import opengl
+from .kernels.ellipse import LEAST_COVARIANCE, MAX_D, MAX_VARIANCE
+from .kernels.project import MAX_COLOR
+from .rasterizer import Image, ShadedSplats, world_to_camera
+from .render_settings import BLUR, CLIP, RasterSettings
 
 Indices = NDArray[np.uint32]
 
@@ -282,15 +282,15 @@ def open_context() -> Any:
     with optional_import("the backend osmesa needs moderngl", "render", BackendError, package="moderngl"):
         import moderngl  # noqa: F401
     reasons = []
-    for kind in contexts.PACKAGES:
-        reason = contexts.probe(kind)
+    for kind in opengl.PACKAGES:
+        reason = opengl.probe(kind)
         if not reason:
             try:
-                return contexts.create(kind)
-            except contexts.NoContextError as error:
+                return opengl.create(kind)
+            except opengl.NoContextError as error:
                 reason = str(error)
         reasons.append(f"{kind}: {reason}")
-    packages = " or ".join(contexts.PACKAGES.values())
+    packages = " or ".join(opengl.PACKAGES.values())
     raise BackendError(
         f"the backend osmesa finds no OpenGL (on Debian and Ubuntu: apt install {packages}; {'; '.join(reasons)})"
     )

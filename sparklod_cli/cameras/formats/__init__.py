@@ -1,1 +1,0 @@
-"""Camera files, one module a format."""

@@ -1,1 +1,0 @@
-"""The Open3D backend, which draws in a separate process."""
