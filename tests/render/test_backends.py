@@ -302,7 +302,7 @@ except SparklodError as error:
 def test_either_opengl_library_is_enough(kind: str) -> None:
     if reason := opengl.probe(kind):
         pytest.skip(f"no OpenGL by {kind} (on Debian and Ubuntu: apt install {opengl.PACKAGES[kind]}): {reason}")
-    only = f"from sparklod_cli.render import opengl\ncontext.PACKAGES = {{{kind!r}: ''}}\n"
+    only = f"from sparklod_cli.render import opengl\nopengl.PACKAGES = {{{kind!r}: ''}}\n"
     done = child(only + DRAW_ONE)
     assert float(done.stdout) == pytest.approx(0.5 * 400 / 400.3, abs=1e-5), done.stderr
 

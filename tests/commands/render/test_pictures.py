@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.images.metrics import psnr
-from sparklod_cli.render import settings
-from sparklod_cli.render.render_settings import BACKENDS
+from sparklod_cli.render.render_settings import BACKENDS, COLOR_BY, STYLES
 from tests.commands.render.runs import AT, DEMO, PLAIN, SIZE, TOWN, TREE, floats, pixels, render
 from tests.conftest import FIXTURES, Capture
 
@@ -115,7 +114,7 @@ def test_two_renders_give_the_same_bytes(tmp_path: Path) -> None:
     assert len(made) == 1
 
 
-@pytest.mark.parametrize("by", settings.COLOR_BY)
+@pytest.mark.parametrize("by", COLOR_BY)
 def test_color_by_draws_a_color_scale(by: str, tmp_path: Path) -> None:
     how = (TOWN, "--budget", "4k", "--size", "480x270", "-q", "--color-by", by)
     assert render(*how, "-o", tmp_path / "bar.png") == 0
@@ -129,7 +128,7 @@ def test_color_by_draws_a_color_scale(by: str, tmp_path: Path) -> None:
     assert image.shape == ((270, 480) if by in ("overdraw", "depth") else (270, 480, 4))
 
 
-@pytest.mark.parametrize("style", settings.STYLES)
+@pytest.mark.parametrize("style", STYLES)
 def test_every_style_draws_something(style: str, tmp_path: Path) -> None:
     assert render(TOWN, "--budget", "4k", *SIZE, "-q", "--style", style, "-o", tmp_path / "x.png") == 0
     assert pixels(tmp_path / "x.png").any()
