@@ -19,7 +19,7 @@ from sparklod_cli import Scene, Splats
 #: Decompresses a file as the codec does and keeps nothing, which every way to inspect it has to do at least.
 INFLATE = """
 import sys
-from sparklod_cli.codecs.inflate import Inflate
+from sparklod_cli.codecs.compression import Inflate
 with open(sys.argv[1], "rb") as file:
     data = Inflate(file)
     while data.read(1 << 20):

@@ -19,8 +19,7 @@ from scenes import load
 
 import sparklod_cli as sparklod
 from sparklod_cli import Splats
-from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.gpu import packed_splats
+from sparklod_cli.codecs import packed_splats, spz
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.reader import decode_file

@@ -9,8 +9,7 @@ import pytest
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.framing import COVERED, covered, fitted
-from sparklod_cli.codecs import ply
-from sparklod_cli.codecs.gpu import ext_splats, packed_splats
+from sparklod_cli.codecs import ext_splats, packed_splats, ply
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io.reading import read_scene

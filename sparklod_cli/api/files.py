@@ -103,15 +103,15 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
         InvalidSplatsError, TreeError: a splat is invalid, or the tree is broken.
         ValueError: there is no such encoding, or no tree for it.
     """
+    from ..codecs import array_files
     from ..codecs.formats import ENCODINGS
-    from ..codecs.gpu import dump
     from ..codecs.reader import check_valid
 
     if encoding not in ENCODINGS:
         raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")
     count = thread_count(threads)
     check_valid(scene_like(scene).splats, count)
-    return dump.pack(scene, encoding, count)
+    return array_files.pack_layout(scene, encoding, count)
 
 
 def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = None) -> Scene:
@@ -125,11 +125,11 @@ def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = No
         FormatError: an array is missing, or has another shape or type.
         TreeError: the tree is broken.
     """
-    from ..codecs.gpu import ext_splats, lod_tree, packed_splats
+    from ..codecs import ext_splats, packed_splats, spark_nodes
     from ..codecs.spark_codings import SplatEncoding
 
     count = thread_count(threads)
-    tree = lod_tree.unpack(arrays).tree if "lod_tree" in arrays else None
+    tree = spark_nodes.unpack(arrays).tree if "lod_tree" in arrays else None
     if "packed" in arrays:
         encoding = SplatEncoding(lod_opacity=tree is not None)
         splats = packed_splats.unpack(arrays, encoding, threads=count)

@@ -158,7 +158,7 @@ def _write_levels(
 
 
 def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:
-    from ..codecs.gpu import dump
+    from ..codecs import array_files
 
     if path.suffix.lower() not in (NPZ, *RAW_SUFFIXES):
         known = ", ".join((NPZ, *RAW_SUFFIXES))
@@ -167,5 +167,5 @@ def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, t
     with naming(path, OF_FILES):
         arrays = pack(scene, encoding, threads=threads)
     with out:
-        size = out.write(path.name, dump.encode(arrays, raw=path.suffix.lower() in RAW_SUFFIXES))
+        size = out.write(path.name, array_files.encode_arrays(arrays, raw=path.suffix.lower() in RAW_SUFFIXES))
         return Written(path, encoding, size)

@@ -141,12 +141,12 @@ def _placed(scene: Scene, settings: BakeSettings, threads: int) -> tuple[Scene, 
 def _write_arrays(
     scene: Scene, layout: str, out: Output, *, raw: bool, threads: int
 ) -> tuple[int, dict[str, tuple[int, ...]]]:
-    from ..codecs.gpu import dump
+    from ..codecs import array_files
 
     try:
-        arrays = dump.pack(scene, layout, threads)
+        arrays = array_files.pack_layout(scene, layout, threads)
     except ValueError:
         raise FormatError(f"it has no tree, which the layout {layout} consists of; build-lod makes one") from None
     with out:
-        size = out.write(out.target.name, dump.encode(arrays, raw=raw))
+        size = out.write(out.target.name, array_files.encode_arrays(arrays, raw=raw))
     return size, {name: words.shape for name, words in arrays.items()}

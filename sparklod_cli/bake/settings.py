@@ -14,7 +14,7 @@ from ..model import MAX_SH_DEGREE
 from ..model.selection import Selection
 
 if TYPE_CHECKING:
-    from ..codecs.clamps import Clamp
+    from ..codecs.losses import Clamp
     from ..fitting.settings import FitSettings, Refined
     from ..lod.tree_settings import DetailSettings, TileSettings
     from ..model.transforms import Transform

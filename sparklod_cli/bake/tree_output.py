@@ -156,7 +156,7 @@ def write_windows(
                 baked.bytes += out.write(each, pieces)
     tallies = [windows(number, CLAMPED) for number in numbers] if encoder.ranges else []
     if any(tally[:, 3].any() for tally in tallies):  # splats beyond any range of a column
-        from ..codecs.clamps import clamps_of
+        from ..codecs.losses import clamps_of
 
         baked.clamped, baked.clamps = clamps_of(tallies, encoder.ranges)
     tree.end("write")

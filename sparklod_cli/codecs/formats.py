@@ -87,7 +87,7 @@ class Format:
 FORMATS = (
     Format(
         "compressed PLY",
-        "compressed_ply",
+        "ply",
         (".ply",),
         rb"ply\s(?:(?!end_header).)*[\r\n]\s*property\s+\w+\s+packed_position\s",
     ),
@@ -130,7 +130,7 @@ FORMATS = (
     # A zip, or its meta.json unpacked.
     Format(
         "SOG",
-        "sog.codec",
+        "sog",
         (".sog", ".json"),
         rb"PK\x03\x04",
         (".sog", "meta.json"),
@@ -157,10 +157,10 @@ MAX_FRACTIONAL_BITS = 24
 #: Deflate levels, and the default; measured in docs/decisions/05-spz.md.
 MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 
-#: Layouts of `convert --layout`, see `gpu.dump.pack`; docs/formats/memory.md has the arrays of each.
+#: Layouts of `convert --layout`, see `array_files.pack_layout`; docs/formats/memory.md has the arrays of each.
 ENCODINGS = ("packed", "ext", "lodtree", "texture")
 
-#: Layouts after which `gpu.lod_tree.nodes` measures nodes, as Spark does once it has loaded a file: ExtSplats,
+#: Layouts after which `spark_nodes.nodes` measures nodes, as Spark does once it has loaded a file: ExtSplats,
 #: PackedSplats of a file that it loads whole, and those of a RAD file that it streams.
 LOADED = ("ext", "packed", "packed-pages")
 

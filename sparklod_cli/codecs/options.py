@@ -91,7 +91,7 @@ class SogOptions(CheckedSettings):
 
     sh_codes: int | None = setting(
         "Most entries of the palette of spherical harmonics, which a label for each splat points into; None for as many"
-        " as suit the number of splats, see `sog.codec.codes_for`.",
+        " as suit the number of splats, see `sog.codes_for`.",
         SH_CODES,
         only_api=True,
     )

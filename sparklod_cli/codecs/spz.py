@@ -15,31 +15,28 @@ import itertools
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model import MAX_SH_DEGREE
 from ..model.gaussian import linear_opacity, lod_opacity
-from ..model.lod_tree import LodTree
-from ..model.scene import Scene
+from ..model.lod_tree import LodTree, NodeStream
+from ..model.scene import SPZ_SCALES, FileCoding, Scene
 from ..model.sh import COEFFICIENTS, notes_on_degree
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..system.errors import FormatError, MembersError, NotSplatsError, TruncatedError, VersionError
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, ordered_map
 from . import compression, quantize
+from .compression import Inflate, Unzstd
+from .encoder import CLAMPED, SPZ_RANGES, CodeRange, Encoded, Windows, results, tally, windows_of
 from .formats import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
+from .options import DEFAULTS, WriteOptions
 from .quantize import ALL_BITS, Bytes
 from .reader import FileNote, OpenFile, Read, Reader, Scratch, Target, comment_of, read_comment, rows_of
-
-if TYPE_CHECKING:
-    from ..model.lod_tree import NodeStream
-    from .encoder import CodeRange, Encoded, Windows
-    from .inflate import Inflate
-    from .options import WriteOptions
-    from .statistics import Statistics
+from .statistics import Statistics, enough, fine_bits
 
 MAGIC = 0x5053474E  # "NGSP"
 HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, fractional bits, flags, reserved
@@ -203,8 +200,6 @@ def open_content(source: OpenFile) -> Reader:
             done += count
             progress("reading", done, layout.total, "B")
 
-    from ..model.scene import SPZ_SCALES, FileCoding  # writing does without
-
     notes = notes_on_degree(layout.sh_degree) + note.problems + notes
     if header.get("unknown_streams"):
         notes += (f"{header['unknown_streams']} streams of an unknown kind are left out",)
@@ -261,7 +256,6 @@ def open_streams(
     if file.read(4) == struct.pack("<I", MAGIC):
         file.seek(0)
         return _open_v4(file, size)
-    from .inflate import Inflate  # not needed to write
 
     file.seek(0)
     inflate = Inflate(file)
@@ -356,7 +350,6 @@ def _open_v4(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows], d
             raise TruncatedError(f"cut short inside stream {stream.name}")
 
     def rows() -> Iterator[StreamRows]:
-        from .unzstd import Unzstd
 
         for stream, (packed, _) in zip(expected, sizes, strict=False):
             end = file.tell() + packed
@@ -444,8 +437,6 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
             chosen for a tree, or for a scene in which x points up.
         ValueError: there are no such bits.
     """
-    from .statistics import Statistics, enough, fine_bits  # not needed to read
-
     version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
     if version not in TREE_SPZ_VERSIONS:
         _check_v4(scene)
@@ -540,14 +531,11 @@ class SpzEncoder:
                 codes[name][unchanged] = stored[here][unchanged, : codes[name].shape[1]]
         if not self.ranges:
             return codes
-        from .encoder import CLAMPED, tally
 
         return codes | {CLAMPED: tally(splats, self.ranges, None if tree is None else tree.is_leaf)}
 
     def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the header and all streams, piece by piece: as one gzip member, or those of version 4."""
-        from .encoder import windows_of
-
         layout, streams, count = self.layout, self.layout.streams(), self.layout.count
         if layout.version not in TREE_SPZ_VERSIONS:
             yield from self._pieces_v4(windows, threads, progress)
@@ -570,8 +558,6 @@ class SpzEncoder:
 
     def _pieces_v4(self, windows: Windows, threads: int, progress: Progress) -> Iterator[bytes]:
         """Return the header, the extensions, the table of streams, and the streams, which are compressed before."""
-        from .encoder import windows_of
-
         layout, streams, frames = self.layout, self.layout.streams(), list[bytes]()
 
         def packed(stream: SpzStream) -> bytes:
@@ -617,8 +603,6 @@ def encoder(
 
     With `counting`, it counts the values that it clamps.
     """
-    from .encoder import SPZ_RANGES  # not needed to read
-
     if options.spz_version is None or options.fractional_bits is None or options.sh_bits is None:
         raise ValueError("the options leave choices open; `settled` makes them")
     if isinstance(scene, Scene):
@@ -660,13 +644,11 @@ def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) ->
 
 def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
     """Return the values that SPZ holds without clamping them."""
-    from .encoder import SPZ_RANGES
-
     return SPZ_RANGES
 
 
 def encode(
-    scene: Scene, options: WriteOptions | None = None, *, threads: int = 1, progress: Progress = silent
+    scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
     """Return the bytes of a file, piece by piece: an LoD file if the scene has a tree, otherwise a plain one.
 
@@ -675,10 +657,7 @@ def encode(
     Raises:
         FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
     """
-    from .encoder import results
-    from .options import DEFAULTS
-
-    of_scene = encoder(scene, settled(scene, options or DEFAULTS))
+    of_scene = encoder(scene, settled(scene, options))
     windows = list(results(of_scene, scene, threads, progress, "encoding"))
     yield from of_scene.pieces(lambda number, name: windows[number][name], threads=threads, progress=progress)
 

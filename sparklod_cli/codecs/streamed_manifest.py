@@ -25,14 +25,12 @@ from ..system.errors import FormatError, VersionError
 from ..system.progress import Progress, silent
 from ..system.units import count_of
 from ..system.untrusted import Json, quoted_value
-from . import quantize
+from . import quantize, sog, sog_images
 from .formats import MANIFEST, ZIP
 from .merging import Chunk, SceneFiles, not_finite
 from .reader import FileNote, OpenCompanion, code_of, read_note
 from .rules import RuleViolation, count_outside, leads_away, nodes_of, parse_manifest, place_of, violation
-from .sog import codec as sog
-from .sog import texel_codings
-from .sog.sog_container import MAX_META, image_names, parse_meta
+from .sog import MAX_META, image_names, parse_meta
 
 #: The version that is read and written. A manifest from before versions has none.
 VERSION = 1
@@ -522,7 +520,7 @@ def scan_splats(
         if any(level for _, level, _ in here) and (unusable := not_finite(chunk, splats)) is not None:
             yield unusable
             return
-        steps = np.ptp(texel_codings.sign_log(splats.center), axis=0) / texel_codings.LAST_WORD if len(splats) else 0.0
+        steps = np.ptp(sog_images.sign_log(splats.center), axis=0) / sog_images.LAST_WORD if len(splats) else 0.0
         for number, level, run in here:
             part = splats.take(slice(run.offset, run.offset + run.count))
             subject = f"{manifest.place(number)} at level {level}"

@@ -21,14 +21,13 @@ from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..system.units import count_of
 from ..system.untrusted import quoted_value
-from . import quantize
+from . import quantize, sog
 from .compression import check_promise
 from .formats import ENVIRONMENT_FILE, MANIFEST, META, chunk_folder
 from .merging import Chunk
 from .options import WriteOptions
 from .reader import OpenCompanion, OpenFile, Reader, note_of, size_of
 from .rules import check_rules, error_of
-from .sog import codec as sog
 from .streamed_manifest import (
     MAX_MANIFEST,
     VERSION,

@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from ..api.bake_jobs import Outcome, Pair
     from ..bake.converting import Converted
     from ..bake.settings import Baked, Source
-    from ..codecs.clamps import Clamp
-    from ..codecs.losses import Losses
+    from ..codecs.losses import Clamp, Losses
     from ..fitting.settings import Refined
     from ..model.instances import Instance
 
@@ -376,7 +375,7 @@ def _written(baked: Baked) -> str:
 
 def _consequences(baked: Baked) -> str:
     """Return a line on the visible effects of clamping; empty without any."""
-    from ..codecs.clamps import clamp_matters
+    from ..codecs.losses import clamp_matters
 
     shares: dict[str, float] = {}
     for clamp in baked.clamps:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from ..codecs import data_texture, ext_splats, packed_splats, spark_nodes
+from ..codecs.array_files import Arrays
 from ..codecs.formats import RAD
-from ..codecs.gpu import data_texture, ext_splats, lod_tree, packed_splats
-from ..codecs.gpu.dump import Arrays
 from ..codecs.rad.rad_reader import RadReader
 from ..codecs.reader import code_of
 from ..codecs.spark_codings import SplatEncoding
@@ -313,7 +313,7 @@ def _of_arrays(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) ->
             opaque = dataclasses.replace(splats, opacity=np.minimum(splats.opacity, np.float32(1)))
             fields["findings"] = values.check(Scene(opaque))
     elif "lod_tree" in arrays:
-        nodes = lod_tree.unpack(arrays)
+        nodes = spark_nodes.unpack(arrays)
         form, count = "NPZ of LodTree", len(nodes.tree)
         note = "it has centres, sizes and children of nodes, but no opacities, colours and shapes"
         if count:

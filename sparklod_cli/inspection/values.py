@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs import quantize
-from ..codecs.clamps import clamp_matters
-from ..codecs.losses import MOST_PAGED_DEGREE, LayoutLoss, sample_loss
+from ..codecs.losses import MOST_PAGED_DEGREE, LayoutLoss, clamp_matters, sample_loss
 from ..codecs.statistics import Distribution
 from ..model.gaussian import spark_size
 from ..model.scene import Scene

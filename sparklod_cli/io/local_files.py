@@ -131,7 +131,7 @@ def _named_in(path: Path) -> list[Path]:
 
 
 def _images_of(path: Path) -> list[Path]:
-    from ..codecs.sog.sog_container import MAX_META, companion_names
+    from ..codecs.sog import MAX_META, companion_names
 
     if not path.is_file() or path.stat().st_size > MAX_META:
         return []
@@ -245,7 +245,7 @@ def read_together(path: Path, sets: Collection[Collection[str]], limit: int) -> 
 
 def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
     """Read colours and opacities for the `count` splats of a scene or a range; raises `FormatError`, which names it."""
-    from ..codecs import rgba
+    from ..codecs import array_files
 
     try:
         if path.exists() and not path.is_file():
@@ -254,7 +254,7 @@ def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
             if is_pointer(file.read(SHORT)):
                 raise FormatError(f"cannot be read: it is {POINTER}")
             file.seek(0)
-            return rgba.decode(file, count, rows)
+            return array_files.decode_rgba(file, count, rows)
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {reason_unreadable(error)}") from None
     except FormatError as error:

@@ -16,7 +16,7 @@ from ..system.stdio import DASH, spooled
 from .local_files import in_folder, open_named, reason_unreadable
 
 if TYPE_CHECKING:
-    from ..codecs.gpu import dump
+    from ..codecs import array_files
 
 
 @contextlib.contextmanager
@@ -88,9 +88,9 @@ def readable() -> Iterator[None]:
         raise UnreadableError(f"cannot be read: {reason_unreadable(error)}") from None
 
 
-def read_arrays(path: Path) -> dump.Arrays | None:
+def read_arrays(path: Path) -> array_files.Arrays | None:
     """Return the arrays of a .npz file; None if a file has another format, or cannot be opened."""
-    from ..codecs.gpu import dump
+    from ..codecs import array_files
 
     try:
         if path != DASH and not path.is_file():
@@ -98,7 +98,7 @@ def read_arrays(path: Path) -> dump.Arrays | None:
         with file_of(path) as file:
             if file.read(len(ZIP)) != ZIP:
                 return None
-            return dump.decode_npz(file)
+            return array_files.decode_npz(file)
     except (OSError, UnreadableError):
         return None
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def _named_by_manifest(target: Place) -> Iterator[str]:
-    from ..codecs.sog.sog_container import MAX_META, companion_names
+    from ..codecs.sog import MAX_META, companion_names
     from ..codecs.streamed_manifest import MAX_MANIFEST, parse
 
     for meta in parse(_content(target, MAX_MANIFEST)).names():

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..codecs.gpu import data_texture
+from ..codecs import data_texture
 from ..model.falloff import HALF_LOG2E, LEAST_EXPONENT, LEAST_REST, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
@@ -608,7 +608,7 @@ class Floats(DataTexture):
 
 
 class Halves(DataTexture):
-    """Two texels per splat, in the layout of antimatter15's viewer: `codecs.gpu.data_texture`.
+    """Two texels per splat, in the layout of antimatter15's viewer: `codecs.data_texture`.
 
     A byte cannot store the opacity of a merged splat, nor a colour above 1. So the word that the viewer leaves unused
     holds two float16: D, and a factor for the colour bytes, usually 1.

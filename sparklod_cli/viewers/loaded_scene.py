@@ -170,11 +170,11 @@ def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding | None, *, precis
     """Return nodes as a traversal reads them, in one of `codecs.formats.PRECISIONS`."""
     if precision == "float32":
         return Nodes(splats.center, spark_size(splats), tree)
-    from ..codecs.gpu import lod_tree
+    from ..codecs import spark_nodes
 
     if precision == "float16":
-        return lod_tree.unpack(lod_tree.pack(splats, tree, threads=threads))
-    return lod_tree.nodes(splats, tree, precision, coding, threads=threads)
+        return spark_nodes.unpack(spark_nodes.pack(splats, tree, threads=threads))
+    return spark_nodes.nodes(splats, tree, precision, coding, threads=threads)
 
 
 def bytes_of(splats: Splats) -> int:

@@ -14,8 +14,8 @@ from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import Baked, BakeSettings
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cli import run
+from sparklod_cli.codecs import spark_nodes
 from sparklod_cli.codecs.formats import WRITABLE
-from sparklod_cli.codecs.gpu import lod_tree
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.fitting import fit, pictures
 from sparklod_cli.fitting.settings import SHARES, FitSettings
@@ -110,7 +110,7 @@ def test_every_format_holds_it_and_a_check_finds_no_fault(folder: Path, fitted: 
 def test_cuts_spend_their_budget(fitted: Scene, share: float) -> None:
     assert fitted.tree is not None
     traversal = SparkViewer(
-        Forest([lod_tree.unpack(lod_tree.pack(fitted.splats, fitted.tree, threads=1))]), [TreeInstance()]
+        Forest([spark_nodes.unpack(spark_nodes.pack(fitted.splats, fitted.tree, threads=1))]), [TreeInstance()]
     )
     budget = int(share * COUNT)
     for eye in ((0.0, 0.0, -6.0), (3.0, -1.0, 2.0)):

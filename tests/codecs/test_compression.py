@@ -15,11 +15,9 @@ import pytest
 import zstandard
 from zlib_ng import zlib_ng
 
-from sparklod_cli.codecs import compression, inflate, spz
-from sparklod_cli.codecs.compression import BLOCK, MIXED, Way
-from sparklod_cli.codecs.inflate import Inflate
+from sparklod_cli.codecs import compression, spz
+from sparklod_cli.codecs.compression import BLOCK, MIXED, Inflate, Unzstd, Way
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.codecs.unzstd import Unzstd
 from sparklod_cli.system.errors import ChecksumError, FormatError, TruncatedError
 from sparklod_cli.system.progress import silent
 from tests.codecs.cases import assert_same, decode, encode
@@ -160,7 +158,7 @@ def test_a_promised_size_is_bounded_by_the_size_of_the_file(total: int, file_siz
 
 # --- Inflating --------------------------------------------------------------------------------------------------------
 
-LIBRARIES = (inflate._library, zlib_ng)
+LIBRARIES = (compression._library, zlib_ng)
 
 WITH_EACH_LIBRARY = pytest.mark.usefixtures("library")
 
@@ -174,7 +172,7 @@ Z_PARTIAL_FLUSH, Z_BLOCK = 1, 5
 @pytest.fixture(params=LIBRARIES, ids=lambda library: library.__name__)
 def library(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """The library that is installed, and the one that replaces it elsewhere."""
-    monkeypatch.setattr(inflate, "_library", request.param)
+    monkeypatch.setattr(compression, "_library", request.param)
 
 
 def flushed(blocks: Iterable[bytes], flush: int) -> bytes:
@@ -290,10 +288,10 @@ def test_a_scene_is_the_same_by_any_writer_on_any_threads(write: Callable[[bytes
 
 
 @WITH_EACH_LIBRARY
-@pytest.mark.parametrize("size", [1, inflate.MOST_COMMENT - 1, inflate.MOST_COMMENT, 1 << 17])
+@pytest.mark.parametrize("size", [1, compression.MOST_COMMENT - 1, compression.MOST_COMMENT, 1 << 17])
 def test_a_comment_is_read_up_to_a_size(size: int) -> None:
     reader = Inflate(io.BytesIO(ours(b"data", b"c" * size)))
-    assert reader.comment == (b"c" * size if size < inflate.MOST_COMMENT else None)
+    assert reader.comment == (b"c" * size if size < compression.MOST_COMMENT else None)
     assert reader.read(9) == b"data"
     reader.finish()
 

@@ -18,8 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from sparklod_cli.codecs import array_files, data_texture, ext_splats, packed_splats, spark_nodes
 from sparklod_cli.codecs.formats import ENCODINGS
-from sparklod_cli.codecs.gpu import data_texture, dump, ext_splats, lod_tree, packed_splats
 from sparklod_cli.codecs.losses import SAMPLE, LayoutLoss, sample_loss
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
 from sparklod_cli.lod import quick
@@ -86,7 +86,7 @@ def test_a_splat_of_ext_splats_is_eight_words_of_these_bytes() -> None:
 
 def test_a_node_is_four_words_of_these_bytes() -> None:
     splats = splats_with(2, center=[1, -2, 0.5], scale=[0.25, 0.5, 0.75], opacity=[1, linear_opacity(np.float32(3))])
-    packed = lod_tree.pack(splats, links([65535, 0], [2**32 - 1, 0]))
+    packed = spark_nodes.pack(splats, links([65535, 0], [2**32 - 1, 0]))
     expected = struct.pack("<4eII", 1, -2, 0.5, 1, 65535, 2**32 - 1) + struct.pack("<4eII", 1, -2, 0.5, 2.4, 0, 0)
     assert packed["lod_tree"].tobytes() == expected
     assert (list(packed), packed["lod_tree"].dtype, packed["lod_tree"].shape) == (["lod_tree"], np.uint32, (2, 4))
@@ -353,9 +353,9 @@ def test_threads_and_blocks_do_not_change_a_word(layout: str) -> None:
     splats = random_splats(BLOCK_ROWS + 1024, sh_degree=3)
     count = np.zeros(len(splats), np.uint16)
     tree = LodTree(count, count.astype(np.uint32))
-    one, two = (dump.pack(Scene(splats, tree), layout, threads) for threads in (1, 2))
+    one, two = (array_files.pack_layout(Scene(splats, tree), layout, threads) for threads in (1, 2))
     rows = slice(BLOCK_ROWS, None)
-    last = {**one} if layout == "packed" else dump.pack(Scene(splats.take(rows), tree.rows(rows)), layout)
+    last = {**one} if layout == "packed" else array_files.pack_layout(Scene(splats.take(rows), tree.rows(rows)), layout)
     for name in one:
         np.testing.assert_array_equal(one[name], two[name])
         if layout != "packed":  # whose ranges follow all splats
@@ -394,9 +394,13 @@ def zeros(*shape: int, dtype: Any = np.uint32) -> np.ndarray:
         (ext_splats.unpack, EXTENDED | {"ext0": zeros(3, 3)}, "ext0 is"),
         (ext_splats.unpack, EXTENDED | {"ext1": zeros(4, 4)}, r"ext1 is .*expected uint32\[3, 4\]"),
         *((ext_splats.unpack, without(EXTENDED, name), f"no array {name}, only ") for name in EXTENDED),
-        (lod_tree.unpack, {}, "no array lod_tree"),
-        (lod_tree.unpack, {"lod_tree": zeros(3, 3)}, "lod_tree is"),
-        (lod_tree.unpack, {"lod_tree": np.uint32([[0, 0, 1, 1], [0, 0, 65536, 2]])}, "node 1 has 65,536 children, a "),
+        (spark_nodes.unpack, {}, "no array lod_tree"),
+        (spark_nodes.unpack, {"lod_tree": zeros(3, 3)}, "lod_tree is"),
+        (
+            spark_nodes.unpack,
+            {"lod_tree": np.uint32([[0, 0, 1, 1], [0, 0, 65536, 2]])},
+            "node 1 has 65,536 children",
+        ),
         (data_texture.capacity, {}, "no array texture, only none"),
         (data_texture.capacity, {"texture": zeros(1, 2048, 4, dtype=np.uint8)}, "texture is uint8"),
         (data_texture.capacity, {"texture": zeros(1, 1024, 4)}, r"expected uint32\[H, 2048, 4\]"),
@@ -429,14 +433,14 @@ def test_an_encoding_with_an_empty_range_is_refused(ranges: dict[str, float], te
 def test_node_sizes_are_those_worked_out_by_hand() -> None:
     splats = splats_with(3, scale=[0.25, 0.5, 0.75], opacity=[0.3, 1, linear_opacity(np.float32(3))])
     np.testing.assert_allclose(gaussian.spark_size(splats), [1, 1, 2.4], rtol=1e-6)
-    sizes = lod_tree.unpack(lod_tree.pack(splats, links([0, 0, 0], [0, 0, 0]))).size
+    sizes = spark_nodes.unpack(spark_nodes.pack(splats, links([0, 0, 0], [0, 0, 0]))).size
     np.testing.assert_array_equal(sizes, np.float16([1, 1, 2.4]))
 
 
 def test_sizes_keep_and_reach_their_error() -> None:
     size = np.exp(np.linspace(-20, np.log(65504), 100_001)).astype(np.float32)
     spheres = splats_with(len(size), scale=(size / 2)[:, None], opacity=1)
-    got = lod_tree.unpack(lod_tree.pack(spheres, links([0] * size.size, [0] * size.size)))
+    got = spark_nodes.unpack(spark_nodes.pack(spheres, links([0] * size.size, [0] * size.size)))
     ratio = np.abs(got.size.astype(np.float64) - size) / half_float(size)
     assert 0.99 <= ratio.max() <= ROUNDING
     assert ratio[size < 2.0**-14].max() >= 0.99
@@ -444,14 +448,14 @@ def test_sizes_keep_and_reach_their_error() -> None:
 
 @given(center=arrays(np.float32, (8, 3), elements=st.floats(-65504, 65504, width=32)))
 def test_centres_of_nodes_keep_their_error(center: np.ndarray) -> None:
-    back = lod_tree.unpack(lod_tree.pack(splats_with(8, center=center), links([0] * 8, [0] * 8))).center
+    back = spark_nodes.unpack(spark_nodes.pack(splats_with(8, center=center), links([0] * 8, [0] * 8))).center
     assert (np.abs(back.astype(float) - center) <= half_float(center)).all()
 
 
 @pytest.mark.filterwarnings("error")
 def test_sizes_and_centres_beyond_float16_are_infinite_without_a_warning() -> None:
     splats = splats_with(1, center=[3e38, -3e38, 65519], scale=3e38, opacity=1000)
-    got = lod_tree.unpack(lod_tree.pack(splats, links([0], [0])))
+    got = spark_nodes.unpack(spark_nodes.pack(splats, links([0], [0])))
     assert got.center.tolist() == [[np.inf, -np.inf, 65504]]
     assert got.size.tolist() == [np.inf]
 
@@ -459,8 +463,8 @@ def test_sizes_and_centres_beyond_float16_are_infinite_without_a_warning() -> No
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_whole_tree_comes_back(threads: int) -> None:
     splats, tree = quick.build(random_splats(BLOCK_ROWS + 1000))
-    packed = lod_tree.pack(splats, tree, threads=threads)
-    got = lod_tree.unpack(packed)
+    packed = spark_nodes.pack(splats, tree, threads=threads)
+    got = spark_nodes.unpack(packed)
     np.testing.assert_array_equal(got.tree.child_count, tree.child_count)
     np.testing.assert_array_equal(got.tree.child_start, tree.child_start)
     np.testing.assert_array_equal(got.center, splats.center.astype(np.float16))
@@ -470,11 +474,11 @@ def test_a_whole_tree_comes_back(threads: int) -> None:
 
 
 def test_trees_of_no_nodes_are_empty_arrays_and_others_need_as_many_nodes_as_splats() -> None:
-    packed = lod_tree.pack(Splats.empty(0, 0), links([], []))
+    packed = spark_nodes.pack(Splats.empty(0, 0), links([], []))
     assert packed["lod_tree"].shape == (0, 4)
-    assert len(lod_tree.unpack(packed).tree) == 0
+    assert len(spark_nodes.unpack(packed).tree) == 0
     with pytest.raises(FormatError, match="2 nodes, but 3 splats"):
-        lod_tree.pack(random_splats(3), links([0, 0], [0, 0]))
+        spark_nodes.pack(random_splats(3), links([0, 0], [0, 0]))
 
 
 # --- The data texture, against a twin that follows the viewer splat by splat ------------------------------------------

@@ -10,9 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import quantize, spark_codings
+from sparklod_cli.codecs import ext_splats, packed_splats, quantize, spark_codings, spark_nodes
 from sparklod_cli.codecs.formats import LOADED
-from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
 from sparklod_cli.codecs.spark_codings import SplatEncoding, log_scale_table
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree, Nodes
@@ -31,7 +30,7 @@ def scene() -> Scene:
 
 def nodes(scene: Scene, layout: str, coding: FileCoding | None = None, threads: int = 1) -> Nodes:
     assert scene.tree is not None
-    return lod_tree.nodes(scene.splats, scene.tree, layout, coding, threads=threads)
+    return spark_nodes.nodes(scene.splats, scene.tree, layout, coding, threads=threads)
 
 
 def unpacked(scene: Scene, layout: str, encoding: SplatEncoding) -> Splats:
@@ -48,7 +47,7 @@ def test_nodes_are_nearly_those_of_unpacked_words(scene: Scene, layout: str, enc
     assert scene.tree is not None
     coding = FileCoding(packed_range=(NARROW.ln_scale_min, NARROW.ln_scale_max))
     found = nodes(scene, layout, coding)
-    twin = lod_tree.unpack(lod_tree.pack(unpacked(scene, layout, encoding), scene.tree))
+    twin = spark_nodes.unpack(spark_nodes.pack(unpacked(scene, layout, encoding), scene.tree))
     assert np.array_equal(found.center, twin.center)
     assert np.mean(found.size != twin.size) < 1e-3
     assert found.tree is scene.tree

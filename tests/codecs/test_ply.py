@@ -16,7 +16,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from fixtures import by_hand, by_hand_compressed_ply
-from sparklod_cli.codecs import compressed_ply, ply
+from sparklod_cli.codecs import ply
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import FormatError, NotSplatsError
@@ -37,30 +37,6 @@ def columns(count: int = 5, sh_degree: int = 0) -> dict[str, np.ndarray]:
 
 def decode(data: bytes) -> Scene:
     return cases.decode(ply, data)
-
-
-def test_every_column_is_decoded_as_worked_out_by_hand() -> None:
-    center = [[1.5, -2.25, 1e6], [0, 0, 0]]
-    rest = np.arange(2 * 9).reshape(2, 9) / 16
-    data = by_hand.ply(
-        by_hand.ply_columns(
-            center,
-            [[0, 1, -1]] * 2,
-            [[2, 0, 0, 0], [0, 0, -3, 4]],
-            [0, math.log(3)],
-            [[0, 1, -1]] * 2,
-            rest.reshape(2, 3, 3),
-        )
-    )
-    scene = decode(data)
-    splats = scene.splats
-    assert (scene.format, scene.tree, scene.antialiased, scene.notes) == ("PLY", None, False, ())
-    np.testing.assert_array_equal(splats.center, center)
-    np.testing.assert_allclose(splats.scale, [[1, math.e, 1 / math.e]] * 2, rtol=1e-6)
-    np.testing.assert_allclose(splats.quat_xyzw, [[0, 0, 0, 1], [0, -0.6, 0.8, 0]], atol=1e-7)
-    np.testing.assert_allclose(splats.opacity, [0.5, 0.75], rtol=1e-6)
-    np.testing.assert_allclose(splats.rgb, [[0.5, 0.5 + SH_C0, 0.5 - SH_C0]] * 2, rtol=1e-6)
-    np.testing.assert_array_equal(splats.sh, rest.reshape(2, 3, 3))
 
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3, 4])
@@ -509,10 +485,6 @@ COMPRESSED = FIXTURES / "golden" / "sh3-compressed.ply"
 GOLDEN = COMPRESSED.read_bytes()
 
 
-def decode_compressed(data: bytes) -> Scene:
-    return cases.decode(compressed_ply, data)
-
-
 def by_words(bounds: list[float], *rows: tuple[int, int, int, int], sh: bytes = b"") -> bytes:
     """A file of one chunk, whose words are given; 12 bounds or, with those of colours, 18."""
     names = by_hand_compressed_ply.compressed_ply(**linear(Scene(random_splats(1)))).split(b"\n")
@@ -533,7 +505,7 @@ HALF = 0.5**0.5
 def test_every_word_is_decoded_as_worked_out_by_hand() -> None:
     none, all_ones = 0, 2**32 - 1
     mixed = 1 << 21 | 7 << 11 | 2047
-    splats = decode_compressed(
+    splats = decode(
         by_words(
             [*POSITION, *SCALE],
             (none, 0 << 30 | 512 << 20 | 512 << 10 | 512, none, 0x00_33_66_FF),
@@ -552,19 +524,19 @@ def test_every_word_is_decoded_as_worked_out_by_hand() -> None:
 
 
 def test_colors_have_bounds_of_their_own() -> None:
-    splats = decode_compressed(by_words([*POSITION, *SCALE, -1, 0, 2, 3, 0.5, 2], (0, 0, 0, 0x00_FF_80_FF))).splats
+    splats = decode(by_words([*POSITION, *SCALE, -1, 0, 2, 3, 0.5, 2], (0, 0, 0, 0x00_FF_80_FF))).splats
     np.testing.assert_allclose(splats.rgb, [[-1, 0.5, 2]], rtol=1e-6)
 
 
 def test_sh_bytes_are_the_middles_of_their_256th_parts_but_for_the_ends() -> None:
     codes = bytes([0, 1, 127, 128, 254, 255, 192, 64, 0])
-    sh = decode_compressed(by_words([*POSITION, *SCALE], (0, 0, 0, 0), sh=codes)).splats.sh
+    sh = decode(by_words([*POSITION, *SCALE], (0, 0, 0, 0), sh=codes)).splats.sh
     values = [-4, -4 + 1.5 / 32, -1 / 64, 1 / 64, 4 - 1.5 / 32, 4, 2 + 1 / 64, -2 + 1 / 64, -4]
     np.testing.assert_array_equal(sh, np.reshape(values, (1, 3, 3)).transpose(0, 2, 1))  # red's come first
 
 
 def test_sh_of_degree_4_are_cut_to_degree_3() -> None:
-    scene = decode_compressed(by_words([*POSITION, *SCALE], (0, 0, 0, 0), sh=bytes(range(72))))
+    scene = decode(by_words([*POSITION, *SCALE], (0, 0, 0, 0), sh=bytes(range(72))))
     assert scene.splats.sh_degree == 3
     assert scene.notes == ("SH degree 4 is cut to 3",)
     np.testing.assert_allclose(scene.splats.sh[0, :, 1], (np.arange(24, 39) + 0.5) / 32 - 4)
@@ -645,7 +617,7 @@ COMPRESSED_REFUSED = {name: (edited(GOLDEN, old, new), why) for name, (old, new,
 def test_broken_compressed_ply_is_refused_with_a_reason(what: str) -> None:
     data, reason = COMPRESSED_REFUSED[what]
     with pytest.raises(FormatError, match=reason):
-        decode_compressed(data)
+        decode(data)
 
 
 def test_what_is_left_out_of_compressed_ply_is_named() -> None:
@@ -659,7 +631,7 @@ def test_what_is_left_out_of_compressed_ply_is_named() -> None:
     others = [each for each in plain.elements if each.name != "vertex"]
     file = io.BytesIO()
     PlyData([others[0], vertex, *others[1:], camera, none]).write(file)
-    scene = decode_compressed(file.getvalue())
+    scene = decode(file.getvalue())
     assert scene.notes == ("its property label_0 is left out", "its element camera_1 is left out")
-    assert decode_compressed(GOLDEN).notes == ()
-    assert_same(scene.splats, decode_compressed(GOLDEN).splats)
+    assert decode(GOLDEN).notes == ()
+    assert_same(scene.splats, decode(GOLDEN).splats)

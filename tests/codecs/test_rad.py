@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fixtures import by_hand_rad
 from sparklod_cli import __version__
-from sparklod_cli.codecs.clamps import clamps_in
+from sparklod_cli.codecs.losses import clamps_in
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.property_codings import CODINGS

@@ -23,10 +23,9 @@ from PIL import Image
 import sparklod_cli
 from fixtures import by_hand_sog
 from sparklod_cli.cli import run
+from sparklod_cli.codecs import sog, sog_images
 from sparklod_cli.codecs.options import SogOptions, WriteOptions
-from sparklod_cli.codecs.sog import codec as sog
-from sparklod_cli.codecs.sog import sog_container, webp
-from sparklod_cli.codecs.sog.webp import MOST_BEFORE, pixels_of, read_header
+from sparklod_cli.codecs.sog_images import MOST_BEFORE, pixels_of, read_header
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
@@ -97,23 +96,6 @@ def test_pixels_of_version_2_are_decoded_as_worked_out_by_hand() -> None:
     np.testing.assert_allclose(splats.scale, np.exp(values), rtol=1e-6)
     np.testing.assert_allclose(splats.rgb, 0.5 + SH_C0 * values, atol=1e-6)  # also of the one that is transparent
     np.testing.assert_allclose(splats.opacity, [0, 1, 0.2, 1 / 255], atol=1e-7)
-
-
-def test_pixels_of_version_1_are_decoded_as_worked_out_by_hand() -> None:
-    meta = {"means": LOGS | {"shape": [4, 3], "files": ["means_l.webp", "means_u.webp"]}}
-    meta |= {"quats": {"shape": [4, 4], "encoding": "quaternion_packed", "files": ["q.webp"]}}
-    meta |= {"scales": {"mins": [-1, 0, 1], "maxs": [0, 0, 3], "files": ["a.webp"]}}
-    meta |= {"sh0": {"mins": [-1, 0, 1, -4], "maxs": [0, 0, 3, 6], "files": ["b.webp"]}}
-    codes = (0, 0, 0, 102), (255, 255, 255, 255), (51, 51, 51, 0), (204, 0, 102, 51)
-    files = POSITIONS | {"a.webp": image(*codes), "b.webp": image(*codes), "q.webp": QUATS}
-    scene = decode(with_meta(meta, files))
-    assert (scene.format, scene.splats.sh_degree) == ("SOG 1", 0)
-    np.testing.assert_allclose(scene.splats.center[:3], CENTERS, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(scene.splats.quat_xyzw[:, [3, 0, 1, 2]], WXYZ, atol=2e-5)
-    values = np.array([[-1, 0, 1], [0, 0, 3], [-0.8, 0, 1.4], [-0.2, 0, 1.8]])
-    np.testing.assert_allclose(scene.splats.scale, np.exp(values), rtol=1e-6)
-    np.testing.assert_allclose(scene.splats.rgb, 0.5 + SH_C0 * values, atol=1e-6)
-    np.testing.assert_allclose(scene.splats.opacity, 1 / (1 + np.exp([0, -6, 4, 2])), atol=1e-6)
 
 
 def test_sh_are_looked_up_by_label_row_and_coefficient() -> None:
@@ -433,14 +415,6 @@ def test_scales_of_any_range_grow_by_a_third_at_most() -> None:
     assert found[0, 0] == 0
 
 
-def test_colours_of_splats_of_opacity_0_stay() -> None:
-    splats = random_splats(50)
-    splats.opacity[:] = 0
-    found = back(Scene(splats))
-    assert (found.opacity == 0).all()
-    np.testing.assert_allclose(found.rgb, splats.rgb, atol=1e-6)
-
-
 @st.composite
 def hard_splats(draw: st.DrawFn) -> Splats:
     """A few splats of values from all over the range of float32."""
@@ -492,10 +466,10 @@ def test_palettes_are_as_large_as_those_of_splat_transform() -> None:
 
 @pytest.mark.parametrize("count", [1, 15, 16, 17, 4096, 4097, 500_000, 16_380**2])
 def test_images_hold_all_splats_in_about_a_square(count: int) -> None:
-    width, height = sog_container.size_for(count)
+    width, height = sog.size_for(count)
     assert width * height >= count
     assert (width % 4, height % 4) == (0, 0)
-    assert height <= width <= webp.MAX_SIDE
+    assert height <= width <= sog_images.MAX_SIDE
     assert width * (height - 4) < count
 
 

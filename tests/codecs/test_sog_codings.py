@@ -14,11 +14,10 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from PIL import Image
 
-from fixtures import by_hand_sog
+from sparklod_cli.codecs import sog_images
+from sparklod_cli.codecs import sog_images as codings
 from sparklod_cli.codecs.kernels import texels
-from sparklod_cli.codecs.sog import texel_codings as codings
-from sparklod_cli.codecs.sog import webp
-from sparklod_cli.codecs.sog.texel_codings import CODES, codebook, even_codebook, nearest
+from sparklod_cli.codecs.sog_images import CODES, codebook, even_codebook, nearest
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import rotation_degrees, stated_degrees
@@ -188,8 +187,8 @@ def encoded(texels: Texels, quality: int = 50, method: int = 1) -> bytes:
 def decoded(data: bytes, most: int = 1 << 30) -> Texels:
     """(height, width, 4) R G B A, where a read gives at most so many bytes."""
     file = io.BytesIO(data)
-    header = webp.read_header(file.read, "x.webp")
-    pixels = webp.pixels_of(header, lambda size: file.read(min(size, most)), "x.webp")
+    header = sog_images.read_header(file.read, "x.webp")
+    pixels = sog_images.pixels_of(header, lambda size: file.read(min(size, most)), "x.webp")
     shape = header.height, header.width, 4
     return pixels.astype("<u4").view(np.uint8).reshape(shape)[..., [2, 1, 0, 3]]
 
@@ -223,13 +222,6 @@ def test_pixels_are_those_that_were_written(name: str) -> None:
         data = encoded(texels, quality, method)
         np.testing.assert_array_equal(decoded(data), expected)
         np.testing.assert_array_equal(decoded(data, most=7), expected)
-
-
-def test_an_extended_header_is_read() -> None:
-    texels = PICTURES["3 colours"]
-    height, width = texels.shape[:2]
-    data = extended(0x10, width, height, encoded(texels)[12:])
-    np.testing.assert_array_equal(decoded(data), texels)
 
 
 # --- What is damaged --------------------------------------------------------------------------------------------------
@@ -270,7 +262,3 @@ def broken_containers() -> Iterator[tuple[str, bytes]]:
 @pytest.mark.parametrize(("name", "data"), [pytest.param(*each, id=each[0]) for each in broken_containers()])
 def test_containers_that_do_not_fit_together_are_refused(name: str, data: bytes) -> None:
     assert is_refused(data)
-
-
-def test_an_image_of_one_colour_is_decoded() -> None:
-    assert (decoded(by_hand_sog.flat_webp(2000, 1000, (9, 8, 7, 6))) == [9, 8, 7, 6]).all()

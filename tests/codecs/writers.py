@@ -23,12 +23,11 @@ from fixtures import (
     by_hand_tiles,
 )
 from sparklod_cli.codecs import gltf as glb
-from sparklod_cli.codecs import ply, quantize, sh_palette, splat, spz
+from sparklod_cli.codecs import ply, quantize, sh_palette, sog, splat, spz
+from sparklod_cli.codecs import sog_images as codings
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.codecs.sog import codec as sog
-from sparklod_cli.codecs.sog import texel_codings as codings
-from sparklod_cli.codecs.sog.codec import LARGE, SEEN
-from sparklod_cli.codecs.sog.texel_codings import codebook
+from sparklod_cli.codecs.sog import LARGE, SEEN
+from sparklod_cli.codecs.sog_images import codebook
 from sparklod_cli.model import morton
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0

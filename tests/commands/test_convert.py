@@ -10,8 +10,8 @@ import pytest
 
 from sparklod_cli.bake.simplifying import leaves_of
 from sparklod_cli.cli import run
+from sparklod_cli.codecs import array_files
 from sparklod_cli.codecs.formats import ENCODINGS, FORMATS, WRITABLE
-from sparklod_cli.codecs.gpu import dump
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS
@@ -105,7 +105,7 @@ def test_the_way_there_and_back_in_the_same_format_keeps_the_bytes(source: str, 
 def test_arrays_are_those_that_the_codec_packs(layout: str, tmp_path: Path, capsys: Capture) -> None:
     path, raw, scene = tmp_path / "a.npz", tmp_path / "a.bin", read_scene(TREES["SPZ"])
     assert convert(TREES["SPZ"], path, "--layout", layout, "--json") == 0
-    record, expected = json.loads(capsys.readouterr().out), dump.pack(scene, layout)
+    record, expected = json.loads(capsys.readouterr().out), array_files.pack_layout(scene, layout)
     assert (record["output_format"], record["bytes"]) == (layout, path.stat().st_size)
     with np.load(path) as file:
         assert set(file) == set(expected) == set(record["arrays"])

@@ -12,8 +12,8 @@ import pytest
 
 from fixtures import by_hand
 from sparklod_cli.cli import run
+from sparklod_cli.codecs.compression import PIECE
 from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.codecs.inflate import PIECE
 from sparklod_cli.commands.inspect import lines
 from sparklod_cli.inspection.findings import CODES, ERROR
 from sparklod_cli.inspection.report import Report, ReportSettings, inspect

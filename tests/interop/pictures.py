@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.codecs.gpu import ext_splats, lod_tree
+from sparklod_cli.codecs import ext_splats, spark_nodes
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
@@ -73,7 +73,7 @@ def cameras_around(center: NDArray[np.floating], width: int, height: int) -> lis
 def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
     """Returns the nodes of sparklod's cut, ascending, without foveation."""
     assert held.tree is not None
-    nodes = lod_tree.unpack(lod_tree.pack(held.splats, held.tree))
+    nodes = spark_nodes.unpack(spark_nodes.pack(held.splats, held.tree))
     view = CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)
     smallest = pixel_limit(camera.fov_y, camera.height)
     return SparkViewer(Forest([nodes]), [TreeInstance()]).cut(view, budget=budget, smallest=smallest).indices()[0]

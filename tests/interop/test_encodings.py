@@ -17,8 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fixtures import by_hand
-from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
+from sparklod_cli.codecs import ext_splats, packed_splats, spark_nodes, spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
 from sparklod_cli.io.reading import read_scene
@@ -124,9 +123,9 @@ def test_the_tree_of_sparks_own_builder_comes_back(spark: Spark, tmp_path: Path,
     held = (
         packed_splats.unpack(words, SplatEncoding(lod_opacity=True)) if layout == "Packed" else ext_splats.unpack(words)
     )
-    nodes = lod_tree.unpack({"lod_tree": words["lodTree"]})
+    nodes = spark_nodes.unpack({"lod_tree": words["lodTree"]})
     nodes.tree.validate()
-    check_tree(lod_tree.pack(held, nodes.tree)["lod_tree"], words["lodTree"], held, share=1e-3)
+    check_tree(spark_nodes.pack(held, nodes.tree)["lod_tree"], words["lodTree"], held, share=1e-3)
     # The size of Spark's LoD design, by which its quick builder sorts, is another one.
     design = 2 * held.scale.max(axis=1) * np.maximum(lod_opacity(held.opacity), 1)
     assert (nodes.size != design.astype(np.float16)).mean() > 0.9

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import ply, splat
-from sparklod_cli.codecs.sog import codec as sog
+from sparklod_cli.codecs import ply, sog, splat
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.splats import Splats
 from tests.conftest import FIXTURES, real_scene

@@ -19,8 +19,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.gpu import ext_splats, lod_tree
+from sparklod_cli.codecs import ext_splats, spark_nodes, spz
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, real_scene
@@ -37,7 +36,7 @@ CHUNK = 65_536
 def spark_tree(spark: Spark, source: Path, builder: str) -> Scene:
     """Returns the tree that Spark builds from a file, as it holds it in memory."""
     words = spark.load_words("Ext", source, lod=BUILDERS[builder])
-    nodes = lod_tree.unpack({"lod_tree": words.pop("lodTree")})
+    nodes = spark_nodes.unpack({"lod_tree": words.pop("lodTree")})
     return Scene(ext_splats.unpack(words), nodes.tree)
 
 

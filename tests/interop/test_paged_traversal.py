@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.gpu import lod_tree
+from sparklod_cli.codecs import spark_nodes
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.foveation import Cones
@@ -228,7 +228,7 @@ def test_the_cut_of_a_file_of_spark_with_missing_chunks_is_that_of_spark(spark: 
     """Three chunks, so that all that can be missing are tried."""
     scene = read_scene(real_scene("rad/biker-spark.rad"))
     assert scene.tree is not None
-    tree = Tree.of(lod_tree.pack(scene.splats, scene.tree)["lod_tree"])
+    tree = Tree.of(spark_nodes.pack(scene.splats, scene.tree)["lod_tree"])
     paged = Paged(spark, [tree], pages=4)
     rng = np.random.default_rng(2)
     for number in range(4):
@@ -250,7 +250,7 @@ def test_a_simulated_flight_is_that_of_spark(spark: Spark, capacity: int | None)
     whole = robot()
     assert whole.tree is not None
     scenes = read_scenes([Instance(whole, "playbot")], precision="float16")
-    paged = Paged(spark, [Tree.of(lod_tree.pack(whole.splats, whole.tree)["lod_tree"])], pages=12)
+    paged = Paged(spark, [Tree.of(spark_nodes.pack(whole.splats, whole.tree)["lod_tree"])], pages=12)
     settings = LodSettings(60_000, SPARKS_CONES)
     rng = np.random.default_rng(3)
     counts = set()

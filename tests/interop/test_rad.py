@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import quantize
-from sparklod_cli.codecs.gpu import packed_splats
+from sparklod_cli.codecs import packed_splats, quantize
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_chunk_header, read_header

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs.gpu import ext_splats, lod_tree
+from sparklod_cli.codecs import ext_splats, spark_nodes
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
@@ -59,14 +59,14 @@ class Tree:
 
     @classmethod
     def of(cls, words: np.ndarray) -> Tree:
-        return cls(words, lod_tree.unpack({"lod_tree": words}))
+        return cls(words, spark_nodes.unpack({"lod_tree": words}))
 
 
 @cache
 def baked(path: Path, method: str = "quick") -> Tree:
     """Bakes a scene; sizes of nodes are those of the splats in Spark's coding, as in Spark."""
     splats, tree = import_module(f"sparklod_cli.lod.{method}").build(read_scene(path).splats)
-    return Tree.of(lod_tree.pack(ext_splats.unpack(ext_splats.pack(splats)), tree)["lod_tree"])
+    return Tree.of(spark_nodes.pack(ext_splats.unpack(ext_splats.pack(splats)), tree)["lod_tree"])
 
 
 def scene(name: str) -> Path:

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.codecs import spark_codings
-from sparklod_cli.codecs.gpu import ext_splats, packed_splats
+from sparklod_cli.codecs import ext_splats, packed_splats, spark_codings
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.splats import Splats

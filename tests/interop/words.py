@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.codecs.gpu import ext_splats, lod_tree, packed_splats
+from sparklod_cli.codecs import ext_splats, packed_splats, spark_nodes
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model import gaussian
@@ -48,7 +48,7 @@ def check_packed(theirs: Words, scene: Scene, encoding: SplatEncoding, share: fl
         np.testing.assert_array_equal(ours[name], theirs[name])
     if scene.tree:
         held = packed_splats.unpack({"packed": theirs["packed"]}, encoding)
-        check_tree(lod_tree.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
+        check_tree(spark_nodes.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
 
 
 def check_ext(theirs: Words, scene: Scene, share: float) -> None:
@@ -60,7 +60,7 @@ def check_ext(theirs: Words, scene: Scene, share: float) -> None:
     np.testing.assert_array_equal(ext_sh(ours), ext_sh(theirs))
     if scene.tree:
         held = ext_splats.unpack({name: theirs[name] for name in ("ext0", "ext1")})
-        check_tree(lod_tree.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
+        check_tree(spark_nodes.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
 
 
 def ext_sh(words: Words) -> NDArray[np.uint32]:
@@ -71,7 +71,7 @@ def ext_sh(words: Words) -> NDArray[np.uint32]:
 
 
 def check_tree(ours: NDArray[np.uint32], theirs: NDArray[np.uint32], held: Splats, share: float) -> None:
-    one, other = (words.view(lod_tree.NODE)[:, 0] for words in (ours, theirs))
+    one, other = (words.view(spark_nodes.NODE)[:, 0] for words in (ours, theirs))
     for name in ("center", "child_count", "child_start"):
         np.testing.assert_array_equal(one[name], other[name])
     steps, error = ties.half(gaussian.spark_size(held))

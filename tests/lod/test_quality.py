@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from sparklod_cli.cameras.camera import DEFAULT_UP, Camera, Settings
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.cameras.sources import cameras_of, orbit_frames
-from sparklod_cli.codecs.gpu import lod_tree
+from sparklod_cli.codecs import spark_nodes
 from sparklod_cli.images.metrics import on_background, psnr
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality, quick
@@ -150,7 +150,7 @@ def picture(splats: Splats, camera: Camera) -> Image:
 def fidelity(splats: Splats, built: tuple[Splats, LodTree], share: float) -> float:
     """Mean PSNR of cuts of so many of the leaves, in dB."""
     nodes, tree = built
-    forest = Forest([lod_tree.unpack(lod_tree.pack(nodes, tree, threads=2))])
+    forest = Forest([spark_nodes.unpack(spark_nodes.pack(nodes, tree, threads=2))])
     traversal = SparkViewer(forest, [TreeInstance()])
     found = []
     for camera in cameras_around(splats):
@@ -172,7 +172,7 @@ def test_cuts_of_a_real_scene_are_closer_to_full_detail_than_those_of_the_quick_
 def test_coarse_cuts_of_a_single_layer_have_no_cracks(share: float) -> None:
     splats = single_layer(70)
     nodes, tree = quality.build(splats)
-    traversal = SparkViewer(Forest([lod_tree.unpack(lod_tree.pack(nodes, tree, threads=2))]), [TreeInstance()])
+    traversal = SparkViewer(Forest([spark_nodes.unpack(spark_nodes.pack(nodes, tree, threads=2))]), [TreeInstance()])
     camera = Camera.look_at((0, -1.2, -0.6), (0, 0, 0), fov_y=40, size=(160, 120))
     cut = traversal.cut(camera, budget=int(share * len(splats))).indices()[0]
     middle = np.s_[30:90, 40:120, 3]

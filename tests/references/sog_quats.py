@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.codecs import quantize
-from sparklod_cli.codecs.sog.texel_codings import FIRST_TAG
+from sparklod_cli.codecs.sog_images import FIRST_TAG
 
 
 def decode_quat(codes: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -19,7 +19,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera, look_at
-from sparklod_cli.codecs.gpu import data_texture
+from sparklod_cli.codecs import data_texture
 from sparklod_cli.figures.pyvista_scene import load_pyvista
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.falloff import MIN_ALPHA

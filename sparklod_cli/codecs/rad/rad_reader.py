@@ -21,7 +21,7 @@ from ...system.errors import FormatError, TooLongError, TruncatedError
 from ...system.progress import Progress
 from ...system.threads import ordered_map
 from .. import compression, spark_codings
-from ..inflate import ERRORS, raw_unpacker
+from ..compression import INFLATE_ERRORS, raw_unpacker
 from ..quantize import Bytes, quat_of_xyz
 from ..reader import OpenCompanion, OpenFile, Reader, Target, size_of
 from ..rules import RuleViolation, check_rules, error_of
@@ -383,7 +383,7 @@ class PackedChunk:
             unpacker = raw_unpacker()
             try:
                 data = unpacker.decompress(data, expected + 1)  # a byte more, to find what is too long
-            except ERRORS:
+            except INFLATE_ERRORS:
                 raise FormatError(f"corrupt data in {subject}") from None
             if len(data) == expected and not unpacker.eof:
                 raise TruncatedError(f"{subject} is cut short: its compressed data do not end")

@@ -146,9 +146,9 @@ print(*sorted(sys.modules))
 """
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "sparklod_cli.codecs.ply" in loaded
-    others = ("cameras.camera", "codecs.sog.sog_container", "codecs.streamed_manifest", "codecs.rad.rad_writer")
+    others = ("cameras.camera", "codecs.sog", "codecs.streamed_manifest", "codecs.rad.rad_writer")
     others += (
-        "codecs.gpu.dump",
+        "codecs.array_files",
         "bake.out_of_core.cluster",
         "bake.out_of_core.in_blocks",
         "bake.skipping",

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.scene import Scene
-from ...model.sh import COEFFICIENTS
-from ...model.splats import FloatArray, Splats
-from ...system.errors import FormatError
-from ...system.threads import for_blocks
-from .. import spark_codings
-from ..spark_codings import (
+from ..model.scene import Scene
+from ..model.sh import COEFFICIENTS
+from ..model.splats import FloatArray, Splats
+from ..system.errors import FormatError
+from ..system.threads import for_blocks
+from . import spark_codings
+from .spark_codings import (
     DEFAULT,
     STEPS_8_8_8,
     SplatEncoding,

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.splats import FloatArray, Splats
-from ...system.threads import for_blocks
-from .. import spark_codings
-from ..spark_codings import STEPS_10_10_12, Words
+from ..model.splats import FloatArray, Splats
+from ..system.threads import for_blocks
+from . import spark_codings
+from .spark_codings import STEPS_10_10_12, Words
 
 SPLAT_0 = np.dtype(
     [

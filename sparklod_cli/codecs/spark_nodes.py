@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.gaussian import size_factor, spark_size
-from ...model.lod_tree import MAX_CHILDREN, LodTree, Nodes
-from ...model.scene import SPZ_SCALES, FileCoding, ScaleCoding
-from ...model.splats import FloatArray, Splats
-from ...system.errors import FormatError
-from ...system.threads import for_blocks
-from .. import quantize, spark_codings
-from ..spark_codings import SplatEncoding, Words, checked_words
+from ..model.gaussian import size_factor, spark_size
+from ..model.lod_tree import MAX_CHILDREN, LodTree, Nodes
+from ..model.scene import SPZ_SCALES, FileCoding, ScaleCoding
+from ..model.splats import FloatArray, Splats
+from ..system.errors import FormatError
+from ..system.threads import for_blocks
+from . import quantize, spark_codings
+from .spark_codings import SplatEncoding, Words, checked_words
 
 NODE = np.dtype(
     [

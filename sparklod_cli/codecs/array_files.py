@@ -1,11 +1,14 @@
-"""Files of colours and opacities: .npy of uint8 or floats, or raw uint8 or float32 (little-endian)."""
+"""Files of arrays: layouts in a viewer's memory as .npz or raw words, colours and opacities as .npy or raw numbers."""
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import tokenize
 import warnings
+import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
@@ -13,9 +16,13 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
+from ..model.scene import Scene
 from ..model.splats import FloatArray
 from ..system.errors import FormatError, TruncatedError
 from ..system.units import count_of
+from ..system.untrusted import quoted, quoted_value
+from . import data_texture, ext_splats, packed_splats, spark_nodes
+from .zip_folder import ZIP_ERRORS
 
 #: Largest header of a .npy file, bytes; that of a two-dimensional array has 118.
 MAX_HEADER = 1 << 12
@@ -71,7 +78,7 @@ def read_values(file: BinaryIO, layout: ArrayLayout) -> NDArray[Any]:
     return values.reshape(layout.shape, order="F" if layout.fortran_order else "C")
 
 
-def decode(file: BinaryIO, count: int, rows: slice | None = None) -> FloatArray:
+def decode_rgba(file: BinaryIO, count: int, rows: slice | None = None) -> FloatArray:
     """Read colours and opacities for the `count` splats of a scene, or for a range: (n, 4) float32, 0..1.
 
     The type of a raw file follows from its size.
@@ -102,3 +109,64 @@ def _raw_layout(file: BinaryIO, count: int) -> ArrayLayout:
     if size % 4:
         raise FormatError(f"has {size:,} bytes, which are not four a splat")
     return ArrayLayout((size // 4, 4), np.dtype(np.uint8))
+
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def pack_layout(scene: Scene, encoding: str, threads: int = 1) -> Arrays:
+    """Return the uint32 arrays, by name, of a scene in one of `formats.ENCODINGS`, see docs/formats/memory.md.
+
+    Raises ValueError if the encoding is that of a tree, and the scene has none.
+    """
+    if encoding == "packed":
+        return packed_splats.pack(scene.splats, packed_splats.of_scene(scene), threads=threads)
+    if encoding == "ext":
+        return ext_splats.pack(scene.splats, threads=threads)
+    if encoding == "texture":  # which does not hold the children of a tree
+        return data_texture.pack(scene.splats, threads=threads)
+    if scene.tree is None:
+        raise ValueError("the scene has no tree")
+    return spark_nodes.pack(scene.splats, scene.tree, threads=threads)
+
+
+def encode_arrays(arrays: Arrays, *, raw: bool = False) -> Iterator[bytes]:
+    """Return the bytes of a .npz file, the same for the same arrays; or, if `raw`, their little-endian words alone."""
+    if raw:
+        yield from (words.astype("<u4", copy=False).tobytes() for words in arrays.values())
+        return
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    yield file.getvalue()
+
+
+def decode_npz(file: BinaryIO) -> Arrays | None:
+    """Read the arrays of a .npz file; None if the file is something else.
+
+    Raises `FormatError` if an array is compressed, cut short or of no plain numbers.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+            if not members or not all(member.filename.endswith(".npy") for member in members):
+                return None
+            return {member.filename.removesuffix(".npy"): _member(archive, member) for member in members}
+    except ZIP_ERRORS:
+        return None
+
+
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[Any]:
+    # Stored members cannot claim more than the file has; compressed ones could, and build-lod writes none.
+    if member.compress_type != zipfile.ZIP_STORED or member.flag_bits & 1:
+        raise FormatError(f"its member {quoted_value(member.filename)} is compressed, unlike those of convert --layout")
+    try:
+        with archive.open(member) as file:
+            data = io.BytesIO(file.read())
+        layout = read_layout(data)
+        if layout is None:
+            raise FormatError("is not a .npy file")
+        return read_values(data, layout)
+    except (*ZIP_ERRORS, OSError) as error:
+        raise FormatError(f"its member {quoted_value(member.filename)} is damaged: {quoted(error)}") from None
+    except FormatError as error:
+        raise type(error)(f"its member {quoted_value(member.filename)} {error}") from None

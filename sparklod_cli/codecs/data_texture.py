@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...model.gaussian import covariance
-from ...model.splats import Splats
-from ...system.errors import FormatError
-from ...system.threads import for_blocks
-from .. import quantize
-from ..spark_codings import Words
+from ..model.gaussian import covariance
+from ..model.splats import Splats
+from ..system.errors import FormatError
+from ..system.threads import for_blocks
+from . import quantize
+from .spark_codings import Words
 
 WIDTH = 2048
 SPLATS_A_ROW = WIDTH // 2

@@ -1,1 +1,0 @@
-"""Encodings of splats and trees in the memory of Spark's shaders."""

@@ -1,1 +1,0 @@
-"""SOG, the file of PlayCanvas: `codec` reads and writes it, the others are its parts."""
