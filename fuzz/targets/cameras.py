@@ -12,9 +12,8 @@ import numpy as np
 
 from fixtures import camera_files
 from sparklod_cli.cameras.camera import Settings
-from sparklod_cli.cameras.camera_files import LARGEST, read
+from sparklod_cli.cameras.camera_files import LARGEST, Files, read
 from sparklod_cli.cameras.camera_formats import FORMATS, NAMES
-from sparklod_cli.cameras.camera_json import Files
 from sparklod_cli.io.local_files import read_together
 
 from ..case import Case, LawError, Rng

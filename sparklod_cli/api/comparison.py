@@ -313,7 +313,7 @@ def compare(
 
 def check_chart(plot: Path, *, overwrite: bool) -> None:
     """Raise a `SparklodError` where a chart cannot be written or drawn."""
-    from ..figures.charts import load_matplotlib
+    from ..images.charts import load_matplotlib
 
     check_writable(plot, overwrite=overwrite)
     load_matplotlib()
@@ -350,7 +350,7 @@ def compare_files(
     table.write(rows, passed=passed)
     groups = rows_by_budget(rows, len(budgets))
     if plot is not None:
-        from ..figures.charts import plot_comparison as chart
+        from ..images.charts import plot_comparison as chart
 
         series = list(zip((budget.text for budget in budgets), groups, strict=True))
         write_file(plot, [chart(series, scenes.title)], overwrite=overwrite)

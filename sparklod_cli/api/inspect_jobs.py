@@ -18,7 +18,7 @@ from ..system.progress import Progress
 from ..tables.assertions import Assertion
 
 if TYPE_CHECKING:
-    from ..figures.tree_plot import DescribedPicture
+    from ..images.tree_plot import DescribedPicture
 
 
 #: Width and height of the thumbnail on a page, pixels; the splats of the cut that it shows; and the most splats of a
@@ -32,7 +32,7 @@ def check_outputs(plot: Path | None, html: Path | None, *, overwrite: bool) -> N
         if target is not None:
             check_writable(target, overwrite=overwrite)
     if plot is not None:
-        from ..figures.pyvista_scene import load_pyvista
+        from ..images.pyvista_scene import load_pyvista
 
         load_pyvista()
 
@@ -76,7 +76,7 @@ def picture_of(scene: Scene | None, by: str, depth: int | None) -> tuple[Describ
     """Return the picture of a scene's structure, see `tree_plot.plot`, or else the reason why it cannot be drawn."""
     if scene is None:
         return None, "it does not hold all of its splats, so they cannot be drawn"
-    from ..figures import tree_plot
+    from ..images import tree_plot
 
     try:
         return tree_plot.plot(scene, by=by, depth=depth), None
@@ -86,7 +86,7 @@ def picture_of(scene: Scene | None, by: str, depth: int | None) -> tuple[Describ
 
 def thumbnail_of(report: Report, scene: Scene, threads: int) -> DescribedPicture | None:
     """Return the scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
-    from ..figures.tree_plot import DescribedPicture
+    from ..images.tree_plot import DescribedPicture
     from ..inspection.report import NO_CHILDREN
     from .files import as_tree
     from .views import cut, orbit, render, show

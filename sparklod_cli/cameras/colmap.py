@@ -9,8 +9,8 @@ from typing import Any
 
 from ..system.errors import CameraPathError
 from .camera import NO_LENS, Frame, Intrinsics, Settings
+from .camera_files import Files, Parsed, decoded, finite, posed, side, whole
 from .camera_formats import FORMATS
-from .camera_json import Files, Parsed, decoded, finite, posed, side, whole
 
 #: An image of images.bin: number, rotation w x y z, translation x y z, and number of its camera; its name follows.
 IMAGE = struct.Struct("<I7dI")

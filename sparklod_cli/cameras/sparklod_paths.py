@@ -11,8 +11,8 @@ import numpy as np
 from ..system.errors import CameraPathError
 from ..system.untrusted import quoted_value
 from .camera import NO_LENS, Frame, Intrinsics, Settings, frame_looking
+from .camera_files import CameraJson, Files, Parsed, finite, posed, side
 from .camera_formats import Axes
-from .camera_json import CameraJson, Files, Parsed, finite, posed, side
 from .sources import Key, between
 
 FORMAT, VERSION = "sparklod-camera-path", 1

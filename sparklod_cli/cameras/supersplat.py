@@ -15,7 +15,7 @@ import numpy as np
 from ..system.errors import CameraPathError
 from ..system.untrusted import quoted_value
 from .camera import Frame, Intrinsics, Matrix, Numbers, Settings, frame_looking
-from .camera_json import CameraJson, Files, Parsed
+from .camera_files import CameraJson, Files, Parsed
 from .sources import along, cardinal_tangents, hermite
 
 UP = (0.0, 1.0, 0.0)

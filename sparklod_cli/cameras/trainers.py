@@ -13,7 +13,7 @@ import numpy as np
 
 from ..system.errors import CameraPathError
 from .camera import NO_LENS, Frame, Intrinsics, Settings, pose
-from .camera_json import CameraJson, Files, Parsed, finite, posed
+from .camera_files import CameraJson, Files, Parsed, finite, posed
 
 #: The camera types of nerfstudio's paths that are read as pinhole cameras.
 PINHOLES = ("perspective", "fisheye")

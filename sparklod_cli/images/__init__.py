@@ -1,1 +1,1 @@
-"""Pictures: pixels and files of them, contact sheets, animations, and how alike two are."""
+"""Pictures: pixels, files, contact sheets and animations; their differences; charts, and plots of scenes and trees."""

@@ -257,7 +257,7 @@ def _charts(
     extremes: Mapping[str, SimulatedFrame],
 ) -> tuple[bytes, str | None]:
     """Return the charts, with the path over the cut of an extreme frame, and why that picture is missing, if it is."""
-    from ..figures import charts
+    from ..images import charts
     from ..viewers.loaded_scene import TREE
 
     frames = [extremes[criterion] for criterion in (*(moment.criterion for moment in moments), "first")]

@@ -320,7 +320,7 @@ class FrameOutputs:
         self.table.check()
         if self.plot is not None:
             check_writable(self.plot, overwrite=self.overwrite)
-            from ..figures.charts import load_matplotlib
+            from ..images.charts import load_matplotlib
 
             load_matplotlib()
         if self.indices is not None:

@@ -23,9 +23,8 @@ from typing import Any
 
 from .. import __version__
 from ..cameras.camera import Settings as CameraSettings
-from ..cameras.camera_files import read
+from ..cameras.camera_files import Files, read
 from ..cameras.camera_formats import NAMES
-from ..cameras.camera_json import Files
 from ..cameras.sources import CameraPath
 from ..io.local_files import leads_away, open_plain, read_text
 from ..model.scene import up_notes_of

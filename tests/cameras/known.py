@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera, Settings
-from sparklod_cli.cameras.camera_files import read
+from sparklod_cli.cameras.camera_files import Files, read
 from sparklod_cli.cameras.camera_formats import NAMES
-from sparklod_cli.cameras.camera_json import Files
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.io.local_files import read_together
 from tests.conftest import FIXTURES

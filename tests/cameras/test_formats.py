@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Settings
-from sparklod_cli.cameras.camera_files import read, read_path
+from sparklod_cli.cameras.camera_files import Files, read, read_path
 from sparklod_cli.cameras.camera_formats import FORMATS
-from sparklod_cli.cameras.camera_json import Files
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.system.errors import CameraPathError
 from tests.cameras.known import (

@@ -21,7 +21,7 @@ from sparklod_cli.codecs import ply
 from sparklod_cli.commands import console as console_module
 from sparklod_cli.commands.build_lod import CLAMPED_BY_SPZ
 from sparklod_cli.commands.console import Console, count_of, say_error
-from sparklod_cli.figures.pyvista_scene import load_pyvista
+from sparklod_cli.images.pyvista_scene import load_pyvista
 from sparklod_cli.io import reading
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene

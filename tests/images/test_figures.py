@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.figures import charts, pyvista_scene, tree_plot
-from sparklod_cli.figures.charts import PathScene, frustum_lines, picture_of_path
-from sparklod_cli.figures.pyvista_scene import viewpoint
-from sparklod_cli.figures.tree_plot import DescribedPicture, color_by
+from sparklod_cli.images import charts, pyvista_scene, tree_plot
+from sparklod_cli.images.charts import PathScene, frustum_lines, picture_of_path
 from sparklod_cli.images.pixels import BACKGROUND
+from sparklod_cli.images.pyvista_scene import viewpoint
+from sparklod_cli.images.tree_plot import DescribedPicture, color_by
 from sparklod_cli.lod import quick
 from sparklod_cli.model.gaussian import covariance, spark_size
 from sparklod_cli.model.lod_tree import LodTree
@@ -205,7 +205,7 @@ def test_a_matplotlibrc_changes_nothing() -> None:
 def test_pyplot_is_left_alone() -> None:
     """It would keep every figure, and ask for a display."""
     program = (
-        "import sys; from tests.tables.rows import flight; from sparklod_cli.figures import charts\n"
+        "import sys; from tests.tables.rows import flight; from sparklod_cli.images import charts\n"
         "charts.draw_charts(flight(3), {}); assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.codecs import data_texture
-from sparklod_cli.figures.pyvista_scene import load_pyvista
+from sparklod_cli.images.pyvista_scene import load_pyvista
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.falloff import MIN_ALPHA
 from sparklod_cli.render import open3d_backend as backend

@@ -34,7 +34,7 @@ def probe_opengl() -> None:
 
 def probe_pyvista() -> None:
     pytest.importorskip("pyvista")
-    from sparklod_cli.figures import pyvista_scene
+    from sparklod_cli.images import pyvista_scene
 
     pyvista_scene.load_pyvista.__wrapped__()
 
@@ -81,7 +81,7 @@ def import_numba_without_forks() -> None:
 STARTED: dict[str, list[Callable[[], object]]] = {
     "bake/out_of_core/cluster": [start_workers],
     "commands/doctor": [check_kernels, find_ffmpeg],
-    "figures/pyvista_scene": [probe_pyvista],
+    "images/pyvista_scene": [probe_pyvista],
     "render/opengl": [probe_opengl],
     "render/open3d_backend": [start_open3d],
     "warmup": [start_warmup, import_numba_without_forks],

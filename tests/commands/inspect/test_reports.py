@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.figures import pyvista_scene, tree_plot
+from sparklod_cli.images import pyvista_scene, tree_plot
 from sparklod_cli.inspection.findings import CODES, Finding
 from sparklod_cli.system.errors import SparklodError
 from tests.commands.inspect.runs import BROKEN, CORRUPT, MISSING, NOTED, PLAIN, TREE, WARNED, inspect, records

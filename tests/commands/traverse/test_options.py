@@ -11,7 +11,7 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.commands.traverse import traverse as command
-from sparklod_cli.figures import charts
+from sparklod_cli.images import charts
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene

@@ -164,7 +164,7 @@ def test_a_plot_is_a_picture(tmp_path: Path, capsys: Capture) -> None:
 def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over a slow network few chunks are there; the picture is of what was drawn with these."""
     pytest.importorskip("matplotlib", reason="charts need the extra `render`")
-    from sparklod_cli.figures import charts
+    from sparklod_cli.images import charts
 
     shown: list[charts.PathScene] = []
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from ..cameras.camera import Camera
-from ..images.pixels import BACKGROUND, FAINT, INK, LINE, write_title
 from ..model.splats import Splats
 from ..render.color_scales import depth_scale
 from ..system.errors import SparklodError, optional_import
 from ..system.units import count_of, percent_of
 from ..tables.columns import Row, numbers, totals
+from .pixels import BACKGROUND, FAINT, INK, LINE, write_title
 from .pyvista_scene import Points, PyvistaStage, Viewpoint, bounds, box_lines, evenly, is_drawable, viewpoint, write_png
 
 #: Colours of the series: stops of the colour scales of `render.color_scales`, and pink for marks.

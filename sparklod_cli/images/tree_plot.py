@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images.picture_files import PLOT_BY
-from ..images.pixels import BACKGROUND
 from ..lod.kernels.tree_links import find_depths
 from ..lod.tree_settings import DEFAULT_BASE
 from ..model.gaussian import lod_opacity, spark_size
@@ -28,6 +26,8 @@ from ..render.color_scales import (
 )
 from ..system.errors import SparklodError
 from ..system.units import count_of
+from .picture_files import PLOT_BY
+from .pixels import BACKGROUND
 from .pyvista_scene import (
     Points,
     PyvistaStage,

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from ..images.pixels import FAINT, INK, LINE, font, write_scale, write_title
 from ..lod.tree_settings import DEFAULT_BASE
 from ..model.gaussian import rotation_matrix
 from ..model.splats import FloatArray, Splats
 from ..render.color_scales import Coloring, ticks
 from ..system.errors import SparklodError, optional_import
 from ..system.python_process import program_command
+from .pixels import FAINT, INK, LINE, font, write_scale, write_title
 
 #: (N, 3) points, or pairs of ends of lines; (3,) for a single point.
 Points = NDArray[np.floating[Any]]

@@ -1,1 +1,0 @@
-"""Pictures of structure: scenes in 3D, charts."""
