@@ -10,7 +10,7 @@ import pytest
 
 from tests.cards import SIMULATE
 
-FOLDERS = "tests/render/test_cards.py", "tests/fitting/cuda"
+TESTS = "tests/render/test_cards.py", "tests/fitting/test_card_optimiser.py"
 
 #: Seconds, far above what either takes.
 PATIENCE = 500
@@ -29,7 +29,7 @@ def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]
 
 @pytest.mark.slow
 def test_kernels_pass_in_the_simulator() -> None:
-    found = run("-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", "cuda", *FOLDERS, **{SIMULATE: "1"})
+    found = run("-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", "cuda", *TESTS, **{SIMULATE: "1"})
     assert found.returncode == 0, found.stdout[-4000:] + found.stderr[-2000:]
     assert "skipped" not in found.stdout.splitlines()[-1], found.stdout
 

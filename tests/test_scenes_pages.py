@@ -28,7 +28,7 @@ from sparklod_cli.viewers.viewer_settings import LodSettings, Network, Streaming
 from tests.conftest import FIXTURES
 from tests.lod.forests import transform
 from tests.scenes import random_splats
-from tests.simulation.paths import SPARK, around, camera, rows_of, without
+from tests.simulation.conftest import SPARK, around, camera, rows_of, without
 
 pytestmark = pytest.mark.slow
 

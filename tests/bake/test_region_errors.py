@@ -18,20 +18,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.rasterizer import shade
 from sparklod_cli.render.render_settings import RasterSettings
-
-
-def cloud(count: int, seed: int, sh_degree: int = 1) -> Splats:
-    """Splats of all kinds in a box of about 4 units."""
-    rng = np.random.default_rng(seed)
-    splats = Splats.empty(count, sh_degree)
-    splats.center[:] = rng.uniform(-2, 2, (count, 3))
-    splats.scale[:] = np.exp(rng.normal(-2.5, 0.7, (count, 3)))
-    quat = rng.normal(size=(count, 4))
-    splats.quat_xyzw[:] = quat / np.linalg.norm(quat, axis=1)[:, None]
-    splats.opacity[:] = rng.uniform(0.05, 1, count)
-    splats.rgb[:] = rng.uniform(0, 1, (count, 3))
-    splats.sh[:] = rng.normal(0, 0.1, splats.sh.shape)
-    return splats
+from tests.scenes import random_splats
 
 
 def scene_of(regions: Sequence[Sequence[Splats]]) -> DetailScene:
@@ -59,7 +46,7 @@ def moved(splats: Splats, scale: float, offset: Sequence[float]) -> Splats:
 @pytest.fixture(scope="module")
 def regions() -> list[list[Splats]]:
     """Three regions at four levels: all splats, and each time fewer."""
-    full = [cloud(count, seed) for seed, count in enumerate((300, 40, 900))]
+    full = [random_splats(count, sh_degree=1, seed=seed) for seed, count in enumerate((300, 40, 900))]
     return [[splats.take(slice(0, None, step)) for step in (1, 2, 3, 20)] for splats in full]
 
 
@@ -68,17 +55,17 @@ def errors(regions: list[list[Splats]]) -> NDArray[np.float64]:
     return measured(scene_of(regions), threads=1)
 
 
+def error_of(*levels: Splats) -> list[float]:
+    """Errors of a scene of one region."""
+    return measured(scene_of([levels]), threads=1)[0].tolist()
+
+
 def test_errors_begin_with_0_and_do_not_decrease(errors: NDArray[np.float64]) -> None:
     assert errors.shape == (3, 4)
     assert (errors[:, 0] == 0).all()
     assert (errors[:, 1] > 0.01).all()
     assert (np.diff(errors, axis=1) >= 0).all()
     assert np.isfinite(errors).all()
-
-
-def test_levels_with_the_same_splats_have_no_error() -> None:
-    splats = cloud(200, 3)
-    assert measured(scene_of([[splats, splats, splats]]), threads=1).tolist() == [[0, 0, 0]]
 
 
 def test_an_error_is_that_of_pictures_of_the_rasterizer(
@@ -106,16 +93,6 @@ def test_an_error_is_that_of_pictures_of_the_rasterizer(
         np.testing.assert_allclose(expected[1:], np.maximum.accumulate(sums[1:] / sums[0]), rtol=0.01)
 
 
-def test_views_are_at_right_angles_and_see_every_harmonic() -> None:
-    turns = parts_output._turns()
-    np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.tile(np.eye(3), (6, 1, 1)), atol=1e-6)
-    np.testing.assert_allclose(np.linalg.det(turns), 1, atol=1e-6)
-    ahead = turns[:, 2]
-    np.testing.assert_allclose(ahead.sum(axis=0), 0, atol=1e-6)
-    assert np.linalg.matrix_rank(ahead) == 3
-    assert abs(parts_output._basis(turns, 15)).min() > 0.05
-
-
 @pytest.mark.parametrize(("scale", "offset"), [(1e-3, (0, 0, 0)), (300.0, (0, 0, 0)), (1.0, (50, -80, 20))])
 def test_size_and_place_of_a_region_do_not_matter(
     regions: list[list[Splats]], errors: NDArray[np.float64], scale: float, offset: Sequence[float]
@@ -124,48 +101,35 @@ def test_size_and_place_of_a_region_do_not_matter(
     np.testing.assert_allclose(measured(scene_of(other), threads=1), errors, rtol=2e-3)
 
 
-def test_other_regions_do_not_matter(regions: list[list[Splats]], errors: NDArray[np.float64]) -> None:
-    alone = [measured(scene_of([region]), threads=1)[0] for region in regions]
-    assert np.array_equal(alone, errors)
-
-
-def test_threads_and_batches_do_not_matter(
+def test_threads_batches_and_other_regions_do_not_matter(
     regions: list[list[Splats]], errors: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    assert np.array_equal([error_of(*region) for region in regions], errors)
     monkeypatch.setattr(parts_output, "BATCH", 500)
     steps: list[tuple[int, int]] = []
-    found = measured(scene_of(regions), threads=2, progress=lambda name, done, total, unit: steps.append((done, total)))
-    assert np.array_equal(found, errors)
+    again = measured(scene_of(regions), threads=2, progress=lambda name, done, total, unit: steps.append((done, total)))
+    assert np.array_equal(again, errors)
     assert steps[-1] == (3, 3)
     assert len(steps) > 1
 
 
-def test_a_level_that_shows_nothing_is_wrong_altogether() -> None:
-    splats = cloud(100, 4)
-    hidden = dataclasses.replace(splats, opacity=np.zeros_like(splats.opacity))
-    assert measured(scene_of([[splats, hidden]]), threads=1).tolist() == [[0, 1]]
-    assert measured(scene_of([[hidden, splats]]), threads=1).tolist() == [[0, 1]]
-    assert measured(scene_of([[hidden, hidden]]), threads=1).tolist() == [[0, 0]]
-
-
-def test_a_level_that_a_region_lacks_has_the_error_of_the_one_before() -> None:
-    splats = cloud(100, 5)
+def test_errors_of_equal_empty_and_invisible_levels() -> None:
+    splats = random_splats(100, sh_degree=1, seed=4)
     none, half = splats.take(slice(0)), splats.take(slice(0, 50))
-    full = measured(scene_of([[splats, half]]), threads=1)[0]
-    assert measured(scene_of([[splats, none, half, none]]), threads=1).tolist() == [[0, 0, full[1], full[1]]]
-    assert measured(scene_of([[none, splats, half]]), threads=1).tolist() == [[0, 0, full[1]]]
-
-
-def test_splats_without_extent_or_a_region_of_one_place() -> None:
-    splats = cloud(5, 6)
+    hidden = dataclasses.replace(splats, opacity=np.zeros_like(splats.opacity))
     dots = dataclasses.replace(splats, center=np.zeros_like(splats.center), scale=np.zeros_like(splats.scale))
-    assert measured(scene_of([[dots, dots.take(slice(0, 1))]]), threads=1).tolist() == [[0, 0]]
+    _, error = error_of(splats, half)
+    assert error_of(splats, splats, splats) == [0, 0, 0]
+    assert error_of(splats, hidden) == error_of(hidden, splats) == [0, 1]
+    assert error_of(hidden, hidden) == [0, 0]
+    assert error_of(splats, none, half, none) == [0, 0, error, error]
+    assert error_of(none, splats, half) == [0, 0, error]
+    assert error_of(dots, dots.take(slice(0, 1))) == [0, 0]
 
 
-def test_colors_that_only_some_directions_see_count() -> None:
-    splats = cloud(100, 7, sh_degree=3)
+def test_colors_seen_from_some_directions_only_count() -> None:
+    splats = random_splats(100, sh_degree=3, seed=7)
     for coefficient in range(15):
         sh = splats.sh.copy()
         sh[:, coefficient] += 0.5
-        found = measured(scene_of([[splats, dataclasses.replace(splats, sh=sh)]]), threads=1)
-        assert found[0, 1] > 1e-3
+        assert error_of(splats, dataclasses.replace(splats, sh=sh))[1] > 1e-3

@@ -25,7 +25,7 @@ def tree() -> sparklod.Tree:
 
 
 def never(count: int) -> float:
-    raise AssertionError("it is not measured")
+    raise AssertionError("a number of splats needs no measure")
 
 
 def splats_of(goal: SimplifyGoal, leaves: int, measure: Callable[[int], float] = never) -> tuple[int, float | None]:
@@ -58,25 +58,20 @@ def test_each_cut_has_at_most_so_many_splats_and_refines_the_coarser_ones(tree: 
     np.testing.assert_array_equal(nodes, np.flatnonzero(tree.tree.is_leaf))
 
 
-def test_a_share_and_a_count_mean_the_same() -> None:
-    share, count = (sparklod.simplify(SCENE, to=each) for each in (0.1, 200))
-    assert len(share.splats) == len(count.splats) <= 200
-    np.testing.assert_array_equal(share.splats.center, count.splats.center)
-    assert share.tree is None and share.up == "-y"
-    assert share.splats.opacity.max() <= 1
+def test_a_share_and_a_count_select_the_same_splats_of_a_scene_and_its_tree(tree: sparklod.Tree) -> None:
+    simplified = [
+        sparklod.simplify(SCENE, to=0.1, threads=3),
+        sparklod.simplify(SCENE, to=200, threads=1),
+        sparklod.simplify(tree, to=200),
+    ]
+    for each in simplified:
+        np.testing.assert_array_equal(each.splats.center, simplified[0].splats.center)
+        assert each.tree is None and each.up == "-y"
+    assert len(simplified[0].splats) <= 200
+    assert simplified[0].splats.opacity.max() <= 1
     assert len(sparklod.simplify(SCENE, to=10**9).splats) == 2000
-
-
-def test_a_tree_is_cut_as_it_is(tree: sparklod.Tree) -> None:
-    one, two = sparklod.simplify(tree, to=300), sparklod.simplify(SCENE, to=300)
-    np.testing.assert_array_equal(one.splats.center, two.splats.center)
     with pytest.raises(ValueError, match="selection and max_sh are for scenes without a tree"):
         sparklod.simplify(tree, to=300, max_sh=0)
-
-
-def test_the_same_splats_for_any_number_of_threads() -> None:
-    one, three = (sparklod.simplify(SCENE, to=0.2, threads=threads) for threads in (1, 3))
-    np.testing.assert_array_equal(one.splats.center, three.splats.center)
 
 
 def test_a_psnr_is_held_by_pictures() -> None:
@@ -123,15 +118,6 @@ def test_the_file_is_as_large_as_it_may_be(most: int) -> None:
     assert size(count) <= most < size(count + 1) + CLOSE_BYTES * most
 
 
-def test_a_scene_that_fits_stays_whole() -> None:
-    assert splats_of(SimplifyGoal(max_bytes=10), 10, float) == (10, None)
-
-
-def test_a_file_that_cannot_be_so_small_is_an_error() -> None:
-    with pytest.raises(sparklod.FormatError, match="one splat takes 501 bytes in this format, more than 7; allow more"):
-        splats_of(SimplifyGoal(max_bytes=7), 9000, lambda count: 500.0 + count)
-
-
 def test_the_fewest_splats_hold_a_psnr() -> None:
     count, psnr = splats_of(SimplifyGoal(psnr=40), 1_000_000, lambda count: 10 * np.log10(count))
     assert 10_000 <= count <= 10_000 * (1 + 2 * CLOSE_COUNT)
@@ -148,7 +134,13 @@ def test_the_fewest_splats_hold_a_psnr() -> None:
         ({"max_bytes": 0}, "max_bytes is 0; give 1 or more"),
     ],
 )
-def test_goals_that_are_none_are_refused(arguments: dict[str, float], text: str) -> None:
+def test_impossible_goals_are_refused(arguments: dict[str, float], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         SimplifyGoal(**arguments)  # type: ignore[arg-type]
+
+
+def test_goals_at_either_end_of_their_range() -> None:
     assert splats_of(SimplifyGoal(to=parse_budget("1%")), 50) == (1, None)
+    assert splats_of(SimplifyGoal(max_bytes=10), 10, float) == (10, None)
+    with pytest.raises(sparklod.FormatError, match="one splat takes 501 bytes in this format, more than 7; allow more"):
+        splats_of(SimplifyGoal(max_bytes=7), 9000, lambda count: 500.0 + count)

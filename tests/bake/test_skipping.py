@@ -1,7 +1,9 @@
-"""An output that is there is baked anew if its recipe or its bytes are other ones, and else not, whatever its date."""
+"""`--skip-existing`: an output is baked again if its recipe or any of its bytes changed, whatever its date."""
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
 import re
 from pathlib import Path
@@ -9,16 +11,29 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.bake import identity, skipping
+from sparklod_cli.bake.identity import NO_PART, BakeIdentity
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.lod.tree_settings import DetailSettings
-from sparklod_cli.system.errors import OutputError
+from sparklod_cli.model.selection import Selection
+from sparklod_cli.model.transforms import Transform
+from sparklod_cli.system.errors import OutputError, UnreadableError
 from tests.conftest import FIXTURES
 
 SETTINGS = BakeSettings()
 STREAMED = BakeSettings(suffix=".json", detail=DetailSettings(levels=(0.3,)))
 CHUNKED = BakeSettings(suffix=".rad", options=WriteOptions(rad=RadOptions(chunked=True)))
+OTHERS = {
+    "method": BakeSettings(method="quality"),
+    "base": BakeSettings(base=1.3),
+    "max_sh": BakeSettings(max_sh=1),
+    "selection.within": BakeSettings(selection=Selection(within=((0, 0, 0), 2.0))),
+    "transform.rotation": BakeSettings(transform=Transform.from_parts(up="-y")),
+    "options.rad.sh_codes": BakeSettings(options=WriteOptions(rad=RadOptions(sh_codes=16))),
+    "suffix": BakeSettings(suffix=".rad"),
+    "environment_beyond": BakeSettings(environment_beyond=9.0),
+}
 
 
 @pytest.fixture
@@ -28,8 +43,73 @@ def scene(tmp_path: Path) -> Path:
     return path
 
 
-def note_of(target: Path) -> Path:
-    return target.with_name(target.name + SUFFIX)
+@pytest.fixture
+def target(tmp_path: Path) -> Path:
+    return tmp_path / "a.spz"
+
+
+def damage(path: Path, *, keep_date: bool, at: int | None = None) -> None:
+    """Flip a bit in the middle of a file, or in the version that a header notes, since the names in it are needed."""
+    times = path.stat()
+    data = bytearray(path.read_bytes())
+    place = data.find(b"sparklod ") + len("sparklod ")
+    data[at if at is not None else place if b"sparklod " in data else len(data) // 2] ^= 1
+    path.write_bytes(data)
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns + (not keep_date)))
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_each_setting_is_part_of_the_identity(scene: Path, name: str) -> None:
+    first, same = BakeIdentity.of(scene, SETTINGS), BakeIdentity.of(scene, BakeSettings(unused=("--up",)))
+    assert first == same
+    assert first.digest == same.digest
+    assert first.differences(same) == []
+    other = BakeIdentity.of(scene, OTHERS[name])
+    assert first.digest != other.digest
+    (difference,) = other.differences(first)
+    assert difference.startswith(f"{name} was ")
+    fields = {field.name for field in dataclasses.fields(BakeSettings)} - {*NO_PART}
+    assert {name.split(".")[0] for name in other.settings} == {*fields, "sparklod"}
+    read = BakeIdentity.from_record(json.loads(json.dumps(dataclasses.asdict(other))))
+    assert read == other
+    assert read.digest == other.digest
+
+
+@pytest.mark.parametrize("record", [{}, [], {"inputs": 3}, {"inputs": [{}], "settings": {}}, None])
+def test_a_damaged_record_of_an_identity_is_refused(record: object) -> None:
+    with pytest.raises(ValueError, match=r"not the identity of a bake"):
+        BakeIdentity.from_record(record)
+
+
+@pytest.mark.parametrize("at", [0, 100, -1])
+def test_content_and_date_of_an_input_are_part_of_the_identity_but_not_its_name(scene: Path, at: int) -> None:
+    before = BakeIdentity.of(scene, SETTINGS)
+    scene = scene.rename(scene.with_name("moved.ply"))
+    assert BakeIdentity.of(scene, SETTINGS).digest == before.digest
+    damage(scene, keep_date=True, at=at)
+    after = BakeIdentity.of(scene, SETTINGS)
+    assert after.differences(before) == [f"{scene} changed since"]
+    os.utime(scene, ns=(0, 0))
+    assert BakeIdentity.of(scene, SETTINGS).digest != after.digest
+
+
+def test_colours_and_files_that_an_input_names_are_inputs(scene: Path, tmp_path: Path) -> None:
+    colors, folder = tmp_path / "colors.npy", tmp_path / "sog"
+    folder.mkdir()
+    (folder / "meta.json").write_text('{"version": 2, "means": {"files": ["means.webp"]}}')
+    for source, file, settings in (
+        (scene, colors, BakeSettings(rgba=colors)),
+        (folder, folder / "means.webp", SETTINGS),
+    ):
+        file.write_bytes(b"one")
+        before = BakeIdentity.of(source, settings)
+        file.write_bytes(b"two")
+        assert BakeIdentity.of(source, settings).differences(before) == [f"{file} changed since"]
+
+
+def test_a_missing_input_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(UnreadableError, match="cannot be read: no such file"):
+        BakeIdentity.of(tmp_path / "none.ply", SETTINGS)
 
 
 @pytest.mark.parametrize(("name", "settings"), [("a.spz", SETTINGS), ("a.rad", CHUNKED)])
@@ -43,59 +123,38 @@ def test_the_same_bake_is_skipped_whatever_the_dates(scene: Path, name: str, set
     assert bake_unless_there(moved, target, settings) is None
 
 
-def test_another_setting_is_refused_or_baked(scene: Path, tmp_path: Path) -> None:
-    target = tmp_path / "a.spz"
+def test_another_setting_or_input_is_refused_or_baked(scene: Path, target: Path) -> None:
     bake_unless_there(scene, target, SETTINGS)
     other = BakeSettings(base=1.3)
     with pytest.raises(OutputError, match=r"a\.spz exists, but base was 1\.5 and is 1\.3; add --overwrite"):
         bake_unless_there(scene, target, other)
     assert bake_unless_there(scene, target, other, overwrite=True) is not None
     assert bake_unless_there(scene, target, other, overwrite=True) is None
+    damage(scene, keep_date=False, at=-40)
+    with pytest.raises(OutputError, match=r"scene\.ply changed since"):
+        bake_unless_there(scene, target, other)
     assert bake_unless_there(scene, target, SETTINGS, overwrite=True) is not None
 
 
-def test_another_input_of_the_same_size_and_date_elsewhere_is_baked(scene: Path, tmp_path: Path) -> None:
-    target, times = tmp_path / "a.spz", scene.stat()
-    bake_unless_there(scene, target, SETTINGS)
-    data = bytearray(scene.read_bytes())
-    data[-40] ^= 1
-    scene.write_bytes(data)
-    os.utime(scene, ns=(times.st_atime_ns, times.st_mtime_ns + 1))
-    with pytest.raises(OutputError, match=r"scene\.ply changed since"):
-        bake_unless_there(scene, target, SETTINGS)
-
-
-def test_an_output_that_is_damaged_replaced_or_gone_is_baked(scene: Path, tmp_path: Path) -> None:
-    target = tmp_path / "a.spz"
+def test_a_truncated_or_missing_output_is_baked(scene: Path, target: Path) -> None:
     bake_unless_there(scene, target, SETTINGS)
     whole = target.read_bytes()
-    for data in (whole[:-1], whole[:100] + b"?" + whole[101:]):
-        target.write_bytes(data)
-        with pytest.raises(OutputError, match="changed since it was baked"):
-            bake_unless_there(scene, target, SETTINGS)
-        bake_unless_there(scene, target, SETTINGS, overwrite=True)
-        assert target.read_bytes() == whole
+    target.write_bytes(whole[:-1])
+    with pytest.raises(OutputError, match="changed since it was baked"):
+        bake_unless_there(scene, target, SETTINGS)
+    bake_unless_there(scene, target, SETTINGS, overwrite=True)
+    assert target.read_bytes() == whole
     target.unlink()
     assert bake_unless_there(scene, target, SETTINGS) is not None
 
 
-def test_a_chunk_that_is_gone_is_missed(scene: Path, tmp_path: Path) -> None:
+def test_a_missing_chunk_is_noticed(scene: Path, tmp_path: Path) -> None:
     target = tmp_path / "a.rad"
     bake_unless_there(scene, target, CHUNKED)
     (chunk,) = tmp_path.glob("*.radc")
     chunk.unlink()
     assert bake_unless_there(scene, target, CHUNKED, overwrite=True) is not None
     assert chunk.exists()
-
-
-def damage(path: Path, *, keep_date: bool) -> None:
-    """Flips a bit in the middle of a file, or in the version that a header notes, since the names in it are needed."""
-    times = path.stat()
-    data = bytearray(path.read_bytes())
-    place = data.find(b"sparklod ") + len("sparklod ")
-    data[place if b"sparklod " in data else len(data) // 2] ^= 1
-    path.write_bytes(data)
-    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns + (not keep_date)))
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.rad", "a-0.radc", "web/lod-meta.json", "web/0_0/sh0.webp"])
@@ -118,7 +177,7 @@ def test_damage_in_any_file_is_found(scene: Path, tmp_path: Path, name: str) -> 
     assert bake_unless_there(scene, target, settings, verify=True) is None
 
 
-def test_nothing_is_read_whose_size_and_date_are_unchanged(
+def test_files_of_unchanged_size_and_date_are_not_read(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     target = tmp_path / "a.rad"
@@ -133,11 +192,10 @@ def test_nothing_is_read_whose_size_and_date_are_unchanged(
     assert sorted(read) == ["a-0.radc", "a.rad", "scene.ply"]
 
 
-def test_an_input_whose_date_was_set_back_is_found_by_verify(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_verify_finds_a_changed_input_whose_date_was_set_back(
+    scene: Path, target: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(identity, "SAMPLE_BYTES", 1)  # so that the sample misses the damage, as in a large file
-    target = tmp_path / "a.spz"
     bake_unless_there(scene, target, SETTINGS)
     damage(scene, keep_date=True)
     assert bake_unless_there(scene, target, SETTINGS) is None
@@ -145,23 +203,18 @@ def test_an_input_whose_date_was_set_back_is_found_by_verify(
         bake_unless_there(scene, target, SETTINGS, verify=True)
 
 
-@pytest.mark.parametrize("note", [None, "", "[]", "{}", '{"bake": {"inputs": 3}}', "\x00"])
-def test_an_output_without_a_note_is_not_trusted(scene: Path, tmp_path: Path, note: str | None) -> None:
-    target = tmp_path / "a.spz"
+@pytest.mark.parametrize("record", [None, "", "[]", "{}", '{"bake": {"inputs": 3}}', "\x00"])
+def test_an_output_without_a_valid_record_is_refused(scene: Path, target: Path, record: str | None) -> None:
     bake_unless_there(scene, target, SETTINGS)
-    note_of(target).unlink()
-    if note is not None:
-        note_of(target).write_text(note)
+    note = target.with_name(target.name + SUFFIX)
+    note.unlink()
+    if record is not None:
+        note.write_text(record)
     with pytest.raises(OutputError, match="there is no record of its inputs and settings"):
         bake_unless_there(scene, target, SETTINGS)
     assert bake_unless_there(scene, target, SETTINGS, overwrite=True) is not None
     assert bake_unless_there(scene, target, SETTINGS) is None
-
-
-def test_a_bake_that_fails_leaves_no_note(scene: Path, tmp_path: Path) -> None:
-    target = tmp_path / "a.spz"
-    bake_unless_there(scene, target, SETTINGS)
     scene.write_bytes(scene.read_bytes()[:-10])
     with pytest.raises(Exception, match=r"."):
         bake_unless_there(scene, target, SETTINGS, overwrite=True)
-    assert not note_of(target).exists()
+    assert not note.exists()  # a bake that fails leaves none

@@ -33,7 +33,7 @@ from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.system.errors import FormatError, HasTreeError, OutputError, UnreadableError
 from sparklod_cli.system.threads import BLOCK_ROWS, ordered_map
-from tests.bake.out_of_core.plain import reader_of
+from tests.bake.jobs import reader_of
 from tests.codecs.cases import Precision, assert_same, decode, encode, put, rotation_degrees, star
 from tests.codecs.writers import WRITERS
 from tests.conftest import FIXTURES

@@ -27,7 +27,7 @@ from tests.interop.spark import NODE, PageUpdate, Spark
 from tests.interop.test_traversal import FOV_Y, FOVEATIONS, LOD_SCALES, SPARKS_CONES, Tree, cameras, scene
 from tests.lod.forests import links, transform
 from tests.lod.sights import CutView
-from tests.simulation.paths import around
+from tests.simulation.conftest import around
 
 pytestmark = pytest.mark.slow
 

@@ -17,7 +17,7 @@ from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.system.errors import FormatError
 from sparklod_cli.system.progress import Progress
-from tests.bake.out_of_core.plain import reader_of
+from tests.bake.jobs import reader_of
 from tests.scenes import random_splats
 
 TRANSFORMS = (

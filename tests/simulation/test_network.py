@@ -1,8 +1,9 @@
-"""Streaming: laws, closed forms, and an exact twin that moves every byte of every transfer at every event."""
+"""Streaming of chunks: the cache, laws and closed forms of the network, and exact twins."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from fractions import Fraction
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.viewers.chunk_cache import Chunks
+from sparklod_cli.viewers.chunk_cache import ChunkCache, Chunks
 from sparklod_cli.viewers.network import ChunkStream
+from sparklod_cli.viewers.spark import header_answers
 from sparklod_cli.viewers.viewer_settings import Network
 from tests.references.streaming import NaiveCache, Twin, roots_first, sized
 
@@ -27,20 +29,11 @@ headers = st.lists(st.lists(st.integers(1, 4000), max_size=3), min_size=3, max_s
 tree_sizes = st.lists(st.lists(st.integers(1, 9999), min_size=1, max_size=6), min_size=1, max_size=3)
 
 
-def here(stream: ChunkStream) -> set[int]:
-    return set(np.flatnonzero(stream.cache.resident()).tolist())
-
-
-def rest(stream: ChunkStream, requested: list[int]) -> list[tuple[float, int]]:
-    """When everything arrives, the camera resting: by what `complete_in` says of one more chunk after the other."""
-    stream.want(requested)
-    arrivals = []
-    for chunk in stream.cache.requested:
-        twin = stream._copy()
-        while chunk not in twin.cache and twin._step(math.inf):
-            pass
-        arrivals.append((twin._since, chunk))
-    return sorted(arrivals)
+def resident(cache: ChunkCache) -> set[int]:
+    present = set(np.flatnonzero(cache.resident()).tolist())
+    assert int(cache.resident().sum()) == len(present)
+    assert all((chunk in cache) == (chunk in present) for chunk in range(len(cache.resident())))
+    return present
 
 
 #: What each chunk file takes: an answer, or one and several after it.
@@ -51,10 +44,10 @@ file_requests = st.lists(
 )
 
 
-@settings(max_examples=400)  # what goes wrong here takes several steps that suit each other
+@settings(max_examples=400)  # faults here take several steps that suit each other
 @given(st.data(), tree_sizes, headers, networks)
 @pytest.mark.slow
-def test_a_stream_does_what_its_twin_does(
+def test_a_stream_of_trees_agrees_with_its_twin(
     data: st.DataObject, sizes: list[list[int]], headers: list[list[int]], network: Network
 ) -> None:
     check_twin(data, sized(sizes, headers[: len(sizes)]), network)
@@ -63,7 +56,7 @@ def test_a_stream_does_what_its_twin_does(
 @settings(max_examples=400)
 @given(st.data(), file_requests, headers, networks, st.none() | st.integers(1, 5))
 @pytest.mark.slow
-def test_a_stream_of_files_of_several_requests_does_what_its_twin_does(
+def test_a_stream_of_files_of_several_requests_agrees_with_its_twin(
     data: st.DataObject,
     requests: list[list[tuple[int, ...]]],
     headers: list[list[int]],
@@ -90,8 +83,8 @@ def check_twin(data: st.DataObject, chunks: Chunks, network: Network) -> None:
         seen += stream.take_arrivals()
         assert seen == [chunk for _, chunk in twin.arrivals]
         assert stream.received == twin.received
-        assert here(stream) == set(twin.cache.used)
-        assert capacity is None or len(here(stream)) <= capacity
+        assert resident(stream.cache) == set(twin.cache.used)
+        assert capacity is None or len(resident(stream.cache)) <= capacity
     complete_in = stream.complete_in(requested)
     if capacity is not None and len(twin.cache.requested) > capacity:
         assert complete_in is None
@@ -171,7 +164,7 @@ def test_the_number_of_time_steps_does_not_matter(
         many.advance(stop)
         one.advance(stop)
         assert many.take_arrivals() == one.take_arrivals()
-        assert here(many) == here(one)
+        assert resident(many.cache) == resident(one.cache)
         assert many.complete_in(requested) == one.complete_in(requested)  # to the last bit
 
 
@@ -237,7 +230,8 @@ def test_one_fetcher_brings_them_in_order_one_after_the_other(
     assert stream.take_arrivals() == order
 
 
-def test_one_chunk_takes_the_latency_and_its_bytes() -> None:
+def test_a_chunk_is_requested_after_the_header_and_arrives_at_its_time() -> None:
+    """The header takes no fetcher, and what it brings of the first chunk is not counted as the chunk."""
     stream = ChunkStream(sized([[MB]]), Network(2.5 * MB, 0.06))
     assert stream.complete_in([0]) == pytest.approx(0.06 + 0.4)
     stream.want([])  # a root is always wanted
@@ -246,10 +240,6 @@ def test_one_chunk_takes_the_latency_and_its_bytes() -> None:
     stream.advance(0.461)
     assert stream.take_arrivals() == [0]
     assert stream.complete_in([0]) == 0
-
-
-def test_no_chunk_is_asked_for_before_the_header_is_there() -> None:
-    """The header takes no fetcher, and what it brings of the first chunk is not counted as the chunk."""
     stream = ChunkStream(sized([[MB, MB]], [[MB // 2]]), Network(MB, 0.1, 1))
     stream.want([])
     stream.advance(0.599)
@@ -261,13 +251,25 @@ def test_no_chunk_is_asked_for_before_the_header_is_there() -> None:
     assert (stream.take_bytes(), stream.take_arrivals()) == (MB, [0])
 
 
-def test_headers_of_several_trees_come_at_once() -> None:
-    """Each with half of the bandwidth; the second one has to be asked for twice."""
-    chunks = sized([[MB], [MB]], [[MB], [MB, 2 * MB]])
-    assert rest(ChunkStream(chunks, Network(2 * MB, 0.5, 1)), []) == [
+def arrivals_at_rest(stream: ChunkStream) -> list[tuple[float, int]]:
+    stream.want([])
+    arrivals: list[tuple[float, int]] = []
+    while stream.cache.missing():
+        stream.step()
+        arrivals += [(stream.now, chunk) for chunk in stream.take_arrivals()]
+    return arrivals
+
+
+def test_transfers_share_the_link() -> None:
+    # Headers of two trees at once, each with half of the bandwidth; the second one takes two answers.
+    headers = sized([[MB], [MB]], [[MB], [MB, 2 * MB]])
+    assert arrivals_at_rest(ChunkStream(headers, Network(2 * MB, 0.5, 1))) == [
         (pytest.approx(0.5 + 1 + 0.5 + 1), 0),  # while half of the longer answer arrives
         (pytest.approx(3.0 + 0.5 + 0.5 + 0.5), 1),
     ]
+    # 1 and 3 MB together at 1 MB/s: the small one has half of it and ends after 2 s, the large one after 4 s.
+    stream = ChunkStream(sized([[1 * MB], [3 * MB]]), Network(1 * MB, 1.0))
+    assert arrivals_at_rest(stream) == [(pytest.approx(3.0), 0), (pytest.approx(5.0), 1)]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 6, 8])
@@ -279,12 +281,6 @@ def test_equal_chunks_come_in_rounds(count: int, fetchers: int) -> None:
     assert stream.complete_in(list(range(count))) == pytest.approx(expected)
 
 
-def test_transfers_share_the_link() -> None:
-    # 1 and 3 MB together at 1 MB/s: the small one has half of it and ends after 2 s, the large one after 4 s.
-    stream = ChunkStream(sized([[1 * MB], [3 * MB]]), Network(1 * MB, 1.0))
-    assert [(pytest.approx(3.0), 0), (pytest.approx(5.0), 1)] == rest(stream, [])
-
-
 def test_fetches_are_not_cancelled_when_the_camera_turns() -> None:
     stream = ChunkStream(sized([[MB] * 5]), Network(MB, 0.5, 1))
     stream.want([])
@@ -294,7 +290,7 @@ def test_fetches_are_not_cancelled_when_the_camera_turns() -> None:
     stream.want([3, 4])  # while 1 is under way
     stream.advance(6.0)
     assert stream.take_arrivals() == [0, 1, 3, 4]
-    assert here(stream) == {0, 1, 3, 4}
+    assert resident(stream.cache) == {0, 1, 3, 4}
 
 
 def test_a_late_chunk_evicts_no_wanted_one() -> None:
@@ -307,7 +303,7 @@ def test_a_late_chunk_evicts_no_wanted_one() -> None:
     stream.advance(9.0)
     assert stream.complete_in([2]) == pytest.approx(1.25)  # it would have to come again
     assert stream.take_arrivals() == [0, 1, 2]  # its bytes have been spent
-    assert here(stream) == {0, 1}
+    assert resident(stream.cache) == {0, 1}
 
 
 @given(st.data(), tree_sizes)
@@ -319,12 +315,12 @@ def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes
     for time in range(data.draw(st.integers(1, 6))):
         stream.advance(time)
         assert stream.take_arrivals() == []
-        before = here(stream)
+        before = resident(stream.cache)
         requested = data.draw(st.lists(st.integers(0, len(chunks.sizes) - 1), max_size=12))
         stream.want(requested)
         admitted = roots_first(chunks, requested)[:capacity]
         assert set(stream.take_arrivals()) == set(admitted) - before
-        assert set(admitted) <= here(stream) <= set(admitted) | before
+        assert set(admitted) <= resident(stream.cache) <= set(admitted) | before
         if capacity is not None:
             assert int(stream.cache.resident().sum()) == min(capacity, len(before | set(admitted)))
         stream.want(requested)  # nothing goes in and out within a frame
@@ -333,23 +329,104 @@ def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes
         assert stream.complete_in(requested) == (0.0 if fits else None)
 
 
-def test_a_stream_refuses_to_go_back_in_time() -> None:
-    stream = ChunkStream(sized([[1]]), start=1.0)
-    for time in (0.5, math.nan, math.inf):
-        with pytest.raises(ValueError, match="it must increase"):
-            stream.advance(time)
+@settings(max_examples=400)
+@given(st.data())
+@pytest.mark.slow
+def test_the_least_recently_used_chunk_is_evicted(data: st.DataObject) -> None:
+    trees = data.draw(st.lists(st.integers(1, 5), min_size=1, max_size=3))
+    chunks = sized([[1] * count for count in trees])
+    capacity = data.draw(st.none() | st.integers(len(trees), len(chunks.sizes) + 1))
+    cache, naive = ChunkCache(chunks, capacity), NaiveCache(capacity)
+    numbers = st.integers(0, len(chunks.sizes) - 1)
+    rooted = False
+    for _ in range(data.draw(st.integers(1, 25))):
+        absent = [chunk for chunk in range(len(chunks.sizes)) if chunk not in cache]
+        if absent and data.draw(st.booleans()):
+            chunk = data.draw(st.sampled_from(absent))
+            importance = {each: -place for place, each in enumerate(cache.requested)}
+            before = resident(cache)
+            evicted = cache.arrive(chunk)
+            assert evicted == naive.arrive(chunk)
+            assert evicted not in cache.admitted
+            assert resident(cache) == (before | {chunk}) - {evicted}
+            if evicted in importance:  # all that are here are wanted, and it is the least important of them
+                assert importance[evicted] == min(importance[each] for each in before | {chunk})
+        else:
+            requested = data.draw(st.lists(numbers, max_size=10))
+            cache.want(requested)
+            rooted = True
+            assert cache.requested == roots_first(chunks, requested)
+            assert cache.admitted == cache.requested[:capacity]
+            naive.want(cache.requested)
+        assert resident(cache) == set(naive.used)
+        assert int(cache.resident().sum()) <= naive.capacity
+        assert cache.missing() == [chunk for chunk in cache.admitted if chunk not in naive.used]
+        assert not rooted or set(chunks.roots) <= set(cache.admitted)
+
+
+def test_unwanted_late_arrivals_are_evicted_first() -> None:
+    cache = ChunkCache(sized([[1, 1, 1], [1]]), 3)
+    cache.want([])
+    for chunk in (0, 3, 1):  # the last is not wanted, and there is room
+        assert cache.arrive(chunk) is None
+    cache.want([2])
+    assert cache.arrive(2) == 1
+    cache = ChunkCache(sized([[1, 1, 1], [1]]), 3)
+    cache.want([2])
+    assert [cache.arrive(chunk) for chunk in (0, 3, 1, 2)] == [None, None, None, 1]
+
+
+def test_a_copy_of_a_cache_is_independent() -> None:
+    cache = ChunkCache(sized([[1, 1, 1]]), 2)
+    cache.want([1])
+    cache.arrive(0)
+    twin = cache.copy()
+    twin.arrive(1)
+    twin.want([2])
+    assert twin.arrive(2) == 1
+    assert resident(cache) == {0}
+    assert cache.requested == [0, 1]
+
+
+def test_chunks_are_numbered_across_trees_and_may_be_requested_by_an_array() -> None:
+    chunks = sized([[5, 6], [7], [8, 9]])
+    assert chunks.sizes == [5, 6, 7, 8, 9]
+    assert chunks.roots == [0, 2, 3]
+    cache = ChunkCache(sized([[1, 1, 1]]))
+    cache.want(np.array([2, 1], np.uint32))
+    assert cache.requested == [0, 2, 1]
+    assert all(type(chunk) is int for chunk in cache.requested)
 
 
 @pytest.mark.parametrize(
-    ("bandwidth", "latency", "fetchers", "message"),
+    ("act", "message"),
     [
-        (0.0, 0.0, 3, "bandwidth is 0"),
-        (math.nan, 0.0, 3, "bandwidth is nan"),
-        (1.0, -1.0, 3, "latency is -1"),
-        (1.0, math.inf, 3, "latency is inf"),
-        (1.0, 0.0, 0, "fetchers is 0"),
+        (lambda: ChunkCache(sized([[1, 1], [1]])).want([3]), "there are 3"),
+        (lambda: ChunkCache(sized([[1, 1], [1]])).want([-1]), "there are 3"),
+        (lambda: ChunkCache(sized([[1], [1, 1]]), 1), "the roots of 2 trees"),
+        (lambda: sized([[1], []]), "chunks of tree 1"),
+        (lambda: sized([[1], [2, -1]]), "chunks of tree 1"),
+        (lambda: sized([[1]], [[1], [2]]), "there are 2 headers of 1 trees"),
+        (lambda: Network(0.0, 0.0, 3), "bandwidth is 0"),
+        (lambda: Network(math.nan, 0.0, 3), "bandwidth is nan"),
+        (lambda: Network(1.0, -1.0, 3), "latency is -1"),
+        (lambda: Network(1.0, math.inf, 3), "latency is inf"),
+        (lambda: Network(1.0, 0.0, 0), "fetchers is 0"),
+        *(
+            (lambda time=time: ChunkStream(sized([[1]]), start=1.0).advance(time), "it must increase")
+            for time in (0.5, math.nan, math.inf)
+        ),
     ],
 )
-def test_impossible_networks_are_refused(bandwidth: float, latency: float, fetchers: int, message: str) -> None:
+def test_impossible_requests_sizes_times_and_networks_are_refused(act: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Network(bandwidth, latency, fetchers)
+        act()
+
+
+def test_a_viewer_asks_for_more_until_the_header_is_whole() -> None:
+    kb, mb = 1 << 10, 1 << 20
+    assert header_answers(0, 9 * mb) == ()
+    assert header_answers(1, 9 * mb) == header_answers(64 * kb, 9 * mb) == (64 * kb,)
+    assert header_answers(64 * kb + 1, 9 * mb) == (64 * kb, 256 * kb)
+    assert header_answers(300 * kb, 9 * mb) == (64 * kb, 256 * kb, mb)
+    assert header_answers(1_616, 1_616) == (1_616,)  # a file that names others and has nothing but the header
