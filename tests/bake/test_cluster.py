@@ -341,21 +341,21 @@ class Once:
             self.act()
 
 
-def test_a_killed_worker_changes_no_byte(engine: ClusterEngine, tmp_path: Path) -> None:
+def test_a_killed_worker_changes_no_byte(tmp_path: Path) -> None:
     expected = baked(DEMO, tmp_path / "none.spz", BakeSettings(), None)
-    engine.client.wait_for_workers(2, timeout=300)  # one that another test killed may only now be replaced
-    pids = list(engine.client.run(os.getpid).values())
-    kill = Once(lambda: os.kill(pids[0], signal.SIGKILL))
-    SAID.clear()
-    assert baked(DEMO, tmp_path / "killed.spz", BakeSettings(), engine, kill)[1] == expected[1]
-    assert kill.acted
-    for _ in range(600):  # the bake may have ended before the scheduler knew
-        engine.tell_losses()
-        if any("was lost" in text for text in SAID):
-            break
-        time.sleep(0.1)
-    else:
-        pytest.fail("the lost worker is not reported")
+    said: list[str] = []
+    with cluster(workers=2, threads=2, say=said.append) as engine:
+        pids = list(engine.client.run(os.getpid).values())
+        kill = Once(lambda: os.kill(pids[0], signal.SIGKILL))
+        assert baked(DEMO, tmp_path / "killed.spz", BakeSettings(), engine, kill)[1] == expected[1]
+        assert kill.acted
+        for _ in range(600):  # the bake may have ended before the scheduler knew
+            engine.tell_losses()
+            if any("was lost" in text for text in said):
+                break
+            time.sleep(0.1)
+        else:
+            pytest.fail("the lost worker is not reported")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["killed.spz", "none.spz"]
 
 
