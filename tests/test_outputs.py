@@ -28,8 +28,7 @@ from sparklod_cli.system.stdio import write_stdout
 from tests.conftest import FIXTURES, IS_ROOT
 from tests.outputs import write_files
 from tests.part_files import put_files
-from tests.system.test_atomic import has_unnamed_files
-from tests.system.test_output_sets import held
+from tests.system.test_output import has_unnamed_files, held
 
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 Files = dict[str, bytes]

@@ -1,6 +1,6 @@
 """Full disks and read-only folders: each is an error of one line, and no file has the final name.
 
-Standard output that is full or closed is in tests/system/test_stdout.py.
+Standard output that is full or closed is in tests/system/test_processes.py.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A writer of RAD files that can get any of their promises wrong; it uses nothing of sparklod.
+"""RAD files written without sparklod that can break any rule of the format, and a table of such files.
 
-A file is built from parts whose fields tests replace: columns, chunks of columns, and the header. What a test does not
-replace follows from the parts, so that each fault stands alone.
+A file is built from parts whose fields can be replaced: columns, chunks of columns, and the header. What is not
+replaced follows from the parts, so that each fault stands alone.
 """
 
 from __future__ import annotations
@@ -216,3 +216,135 @@ def with_chunk(rad: Rad, number: int, change: Callable[[Chunk], Chunk]) -> Rad:
 def with_fields(part: Any, **fields: Any) -> Any:
     """A file, chunk or column with wrong fields of its header."""
     return replace(part, fields=part.fields | fields)
+
+
+# --- Faults -----------------------------------------------------------------------------------------------------------
+
+#: Sound files: chunks of all nodes, two chunks, with spherical harmonics, with a palette of them, with both.
+SMALL, TWO = tree(24), tree()
+SH, PALETTE = tree(24, max_sh=2), tree(24, max_sh=2, palette=True)
+LATER = tree(CHUNK + 8, max_sh=1, palette=True)
+
+
+def column(rad: Rad, name: str, number: int = 0, /, **changes: object) -> Rad:
+    """A file with one column of a chunk changed."""
+    return with_chunk(rad, number, lambda chunk: chunk.changed(name, lambda each: replace(each, **changes)))  # type: ignore[arg-type]
+
+
+def property_fields(rad: Rad, name: str, number: int = 0, /, **changes: object) -> Rad:
+    """A file with wrong fields of one property of a chunk."""
+    return with_chunk(rad, number, lambda chunk: chunk.changed(name, lambda each: with_fields(each, **changes)))
+
+
+def chunk_fields(rad: Rad, number: int, /, **changes: object) -> Rad:
+    """A file with wrong fields in the header of a chunk."""
+    return with_chunk(rad, number, lambda chunk: with_fields(chunk, **changes))
+
+
+def chunk_with(rad: Rad, number: int, /, **changes: object) -> Rad:
+    """A file with other parts of a chunk."""
+    return with_chunk(rad, number, lambda chunk: replace(chunk, **changes))  # type: ignore[arg-type]
+
+
+def with_columns(rad: Rad, names: str) -> Rad:
+    """A small file with the columns of these names, in this order."""
+    (chunk,) = rad.chunks
+    known = {each.name: each for each in chunk.columns}
+    return chunk_with(rad, 0, columns=tuple(known[name] for name in names.split()))
+
+
+def without(rad: Rad, name: str) -> Rad:
+    """A small file without one of its columns."""
+    return with_columns(rad, " ".join(each.name for each in rad.chunks[0].columns if each.name != name))
+
+
+RGB = next(each.data for each in SMALL.chunks[0].columns if each.name == "rgb")
+NO_LOD_OPACITY = RANGES | {"lodOpacity": False}
+
+#: Files with faults, and the codes of their findings.
+FAULTS: dict[str, tuple[Rad, set[str]]] = {
+    "another type": (with_fields(SMALL, type="mesh"), {"file.not-splats"}),
+    "another version": (with_fields(SMALL, version=2), {"container.version"}),
+    "a degree that does not exist": (chunk_fields(with_fields(SMALL, maxSh=4), 0, maxSh=4), {"container.version"}),
+    "no count": (with_fields(SMALL, count=None), {"container.corrupt"}),
+    "a chunk too many": (with_fields(SMALL, count=CHUNK + 1), {"rad.chunks"}),
+    "a chunk too few": (with_fields(TWO, count=CHUNK), {"rad.chunks"}),
+    "chunks of nothing": (with_fields(SMALL, chunkSize=0), {"rad.chunks"}),
+    "chunks of another size": (tree(48, chunk=24), {"rad.chunk-size"}),
+    "one splat less in the header": (with_fields(TWO, count=CHUNK + 7), {"rad.bases"}),
+    "one splat less in a chunk": (chunk_fields(TWO, 1, count=7), {"rad.bases"}),
+    "another base": (chunk_fields(TWO, 1, base=0), {"rad.bases"}),
+    "chunks that overlap": (replace(TWO, entries={1: {"offset": 0}}), {"rad.offsets"}),
+    "a gap between chunks": (replace(TWO, entries={1: {"offset": 1 << 20}}), {"rad.offsets"}),
+    "an offset in a file of its own": (
+        replace(SMALL, stem="a", entries={0: {"offset": 8}}),
+        {"rad.offsets", "rad.chunk-files"},
+    ),
+    "another sum": (with_fields(TWO, allChunkBytes=1), {"rad.total"}),
+    "bytes behind the last chunk": (replace(TWO, more=bytes(8)), {"container.trailing"}),
+    "an entry that is too large": (
+        replace(SMALL, entries={0: {"bytes": 1 << 20}}),
+        {"container.cut-short", "rad.total"},
+    ),
+    "no file of a chunk": (replace(SMALL, entries={0: {"filename": "b.radc"}}), {"rad.chunk-files"}),
+    "a file of a chunk elsewhere": (replace(SMALL, entries={0: {"filename": "../b.radc"}}), {"rad.chunk-files"}),
+    "a short file of a chunk": (
+        replace(SMALL, stem="a", entries={0: {"bytes": 1 << 20}}, fields=SMALL.fields | {"allChunkBytes": 1 << 20}),
+        {"rad.chunk-files"},
+    ),
+    "another magic of a chunk": (chunk_with(TWO, 1, magic=b"RADX"), {"rad.chunk-header"}),
+    "another version of a chunk": (chunk_fields(TWO, 1, version=2), {"rad.chunk-header"}),
+    "a chunk without a base": (chunk_fields(TWO, 1, base=None), {"rad.chunk-header"}),
+    "another degree in a chunk": (chunk_fields(SH, 0, maxSh=1), {"rad.kind"}),
+    "a chunk without a tree": (chunk_fields(SMALL, 0, lodTree=None), {"rad.kind"}),
+    "other ranges in a chunk": (chunk_fields(SMALL, 0, splatEncoding=RANGES | {"rgbMax": 2.0}), {"rad.ranges"}),
+    "another size of the payload in JSON": (chunk_fields(SMALL, 0, payloadBytes=8), {"rad.sizes"}),
+    "another size before the payload": (chunk_with(SMALL, 0, payload_bytes=8), {"rad.sizes"}),
+    "bytes behind the properties": (chunk_with(SMALL, 0, more=bytes(16)), {"rad.sizes"}),
+    "a property elsewhere": (property_fields(SMALL, "alpha", offset=0), {"rad.offsets"}),
+    "a property that is unknown": (column(SMALL, "rgb", name="hue"), {"rad.properties"}),
+    "a property less": (without(SMALL, "rgb"), {"rad.properties"}),
+    "no children": (without(SMALL, "child_count"), {"rad.properties", "tree.orphan", "tree.leaf-start"}),
+    "no degree 2": (without(SH, "sh2"), {"rad.properties"}),
+    "a property twice": (
+        with_columns(SMALL, "center alpha rgb scales orientation child_count child_start rgb"),
+        {"rad.properties"},
+    ),
+    "a degree too many": (chunk_fields(with_fields(SH, maxSh=1), 0, maxSh=1), {"rad.properties"}),
+    "children without a tree": (chunk_fields(with_fields(SMALL, lodTree=False), 0, lodTree=False), {"rad.properties"}),
+    "another order": (
+        with_columns(SMALL, "center alpha scales rgb orientation child_count child_start"),
+        {"rad.order"},
+    ),
+    "an encoding of another property": (property_fields(SMALL, "center", encoding="s8"), {"rad.encoding"}),
+    "an encoding that is unknown": (property_fields(SMALL, "center", encoding="f8"), {"rad.encoding"}),
+    "a compression that is unknown": (property_fields(SMALL, "center", compression="br"), {"rad.encoding"}),
+    "no end of a range": (property_fields(SMALL, "rgb", max=None), {"rad.encoding"}),
+    "a range that is empty": (property_fields(SMALL, "rgb", max=0.0), {"rad.encoding"}),
+    "a range of SH that is empty": (property_fields(SH, "sh1", max=0.0), {"rad.encoding"}),
+    "a property that is too short": (column(SMALL, "rgb", data=bytes(3)), {"container.cut-short"}),
+    "a property that is too long": (column(SMALL, "rgb", data=bytes(73)), {"container.too-long"}),
+    "a property that is not deflated": (column(SMALL, "rgb", stored=b"\xff" * 9), {"container.corrupt"}),
+    "a deflate stream that does not end": (column(SMALL, "rgb", stored=deflated(RGB)[:-3]), {"container.cut-short"}),
+    "a palette of another size": (with_fields(PALETTE, shCodeCount=8), {"rad.palette"}),
+    "a palette that is shorter": (column(PALETTE, "sh1_code", data=b"\x10" * 9 * 8), {"container.cut-short"}),
+    "a palette in a later chunk": (
+        chunk_with(LATER, 1, columns=(LATER.chunks[0].columns[5], *LATER.chunks[1].columns)),
+        {"rad.palette", "rad.order"},
+    ),
+    "a label beyond the palette": (column(PALETTE, "sh_label", data=b"\x20\0" * 24), {"rad.palette"}),
+    "no labels": (without(PALETTE, "sh_label"), {"rad.palette", "rad.properties"}),
+    "labels without a palette": (with_fields(PALETTE, shCodeCount=None), {"rad.palette"}),
+    "labels and coefficients": (
+        chunk_with(PALETTE, 0, columns=(*PALETTE.chunks[0].columns, SH.chunks[0].columns[5])),
+        {"rad.palette", "rad.order"},
+    ),
+    "a large header": (with_fields(SMALL, comment="c" * (1 << 16)), {"rad.header-large"}),
+    "a header that is too large": (with_fields(SMALL, comment="c" * (1 << 20)), {"rad.header-limit"}),
+    "opacities that are not of a tree": (
+        chunk_fields(with_fields(SMALL, splatEncoding=NO_LOD_OPACITY), 0, splatEncoding=NO_LOD_OPACITY),
+        {"rad.opacity"},
+    ),
+    "padding of the header": (replace(SMALL, pad=b"x"), {"rad.padding"}),
+    "padding of a chunk": (chunk_with(SMALL, 0, pad=b"x"), {"rad.padding"}),
+}

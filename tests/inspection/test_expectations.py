@@ -1,4 +1,4 @@
-"""Expectations of files, which are assertions about reports, and files of them."""
+"""Assertions about reports, from options and from files, one a line."""
 
 from __future__ import annotations
 
@@ -13,58 +13,67 @@ from sparklod_cli.inspection.expectations import ExpectationError, check, parse,
 from sparklod_cli.inspection.report import NoFieldError, Report, ReportSettings, inspect
 from sparklod_cli.system.errors import SparklodError
 from tests.conftest import FIXTURES, Capture
-from tests.inspection.expected import DEPTH, LEAVES, NODES, PLAIN, TREE, written
+
+TREE, PLAIN = FIXTURES / "golden" / "hand-tree-v3.spz", FIXTURES / "golden" / "sh3-v3.spz"
+
+
+def written(folder: Path, text: str, name: str = "expect.txt") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(scope="module")
+def tree() -> Report:
+    """Nine nodes, of which six are leaves, and two edges from the root to the deepest."""
+    return inspect(TREE, ReportSettings(values=True, all_quantities=True))[0]
+
+
+@pytest.fixture(scope="module")
+def plain() -> Report:
+    return inspect(PLAIN, ReportSettings(values=True))[0]
 
 
 def codes(report: Report, *texts: str) -> list[str]:
-    return [found.code for found in check(report, [parse(text) for text in texts])]
+    return [finding.code for finding in check(report, [parse(text) for text in texts])]
 
 
 @pytest.mark.parametrize(
-    ("left", "holds", "fails", "code"),
+    ("path", "left", "holds", "fails", "code"),
     [
-        ("bytes<=", TREE.stat().st_size, TREE.stat().st_size - 1, "expect.bytes"),
-        ("leaves>=", LEAVES, LEAVES + 1, "expect.splats"),
-        ("leaves<=", LEAVES, LEAVES - 1, "expect.splats"),
-        ("sh==", 0, 1, "expect.sh"),
-        ("lod==", "true", "false", "expect.lod"),
-        ("growth<=", NODES / LEAVES, 1.4, "expect.growth"),
-        ("tree.depth==", DEPTH, 3, "expect.value"),
+        (TREE, "bytes<=", TREE.stat().st_size, TREE.stat().st_size - 1, "expect.bytes"),
+        (TREE, "leaves>=", 6, 7, "expect.splats"),
+        (TREE, "leaves<=", 6, 5, "expect.splats"),
+        (TREE, "sh==", 0, 1, "expect.sh"),
+        (TREE, "lod==", "true", "false", "expect.lod"),
+        (TREE, "growth<=", 1.5, 1.4, "expect.growth"),
+        (TREE, "tree.depth==", 2, 3, "expect.value"),
+        (PLAIN, "leaves>=", 60, 61, "expect.splats"),
+        (PLAIN, "leaves<=", 60, 59, "expect.splats"),
+        (PLAIN, "sh==", 3, 2, "expect.sh"),
+        (PLAIN, "lod==", "false", "true", "expect.lod"),
     ],
 )
-def test_each_expectation_of_a_tree_holds_or_gives_its_code(
-    left: str, holds: object, fails: object, code: str, tree: Report, capsys: Capture
+def test_each_expectation_holds_or_gives_its_code(
+    path: Path, left: str, holds: object, fails: object, code: str, capsys: Capture
 ) -> None:
-    assert codes(tree) == []
-    assert codes(tree, f"{left}{holds}") == []
-    assert codes(tree, f"{left}{fails}") == [code]
-    assert run(["inspect", str(TREE), "--assert", f"{left}{holds}"]) == 0
-    assert capsys.readouterr() == ("", f"{TREE}: OK: 9 nodes, no problems found\n")
-    assert run(["inspect", str(TREE), "--assert", f"{left}{fails}"]) == 3
+    assert run(["inspect", str(path), "--assert", f"{left}{holds}"]) == 0
     out, err = capsys.readouterr()
-    assert out.startswith(f"{TREE}: error: {code}: ")
+    assert (out, err.startswith(f"{path}: OK: ")) == ("", True)
+    assert run(["inspect", str(path), "--assert", f"{left}{fails}"]) == 3
+    out, err = capsys.readouterr()
+    assert out.startswith(f"{path}: error: {code}: ")
     assert (out.count("\n"), err) == (1, "")
 
 
-def test_each_expectation_of_plain_splats_holds_or_gives_its_code(plain: Report) -> None:
-    for left, holds, fails, code in [
-        ("leaves>=", 60, 61, "expect.splats"),
-        ("leaves<=", 60, 59, "expect.splats"),
-        ("sh==", 3, 2, "expect.sh"),
-        ("lod==", "false", "true", "expect.lod"),
-    ]:
-        assert codes(plain, f"{left}{holds}") == []
-        assert codes(plain, f"{left}{fails}") == [code]
-    assert codes(plain, "growth<=9") == ["expect.growth"]  # there is none without a tree
-
-
-def test_every_expectation_that_fails_is_reported(tree: Report) -> None:
+def test_every_expectation_that_fails_is_reported(tree: Report, plain: Report) -> None:
     texts = ("bytes<=1", "leaves<=1", "sh==3", "lod==false", "growth<=1", "splats==1")
     found = check(tree, [parse(text) for text in texts])
     assert [each.code.removeprefix("expect.") for each in found] == ["bytes", "splats", "sh", "lod", "growth", "value"]
     assert found[1].message == "leaves<=1: leaves is 6"
     assert found[4].message == "growth<=1: growth is 1.5"
     assert found[5].message == "splats==1: splats is 9"
+    assert codes(plain, "growth<=9") == ["expect.growth"]  # there is none without a tree
 
 
 def test_an_unreadable_file_is_not_checked_further() -> None:
@@ -77,9 +86,9 @@ def test_an_unreadable_file_is_not_checked_further() -> None:
     ("way", "holds", "fails"),
     [
         ("format", '=="SPZ 3 LoD"', '=="SPZ 2 LoD"'),
-        ("splats", f"=={NODES}", f"=={NODES + 1}"),
+        ("splats", "==9", "==10"),
         ("antialiased", "==false", "==true"),
-        ("tree.depth", f"=={DEPTH}", "==3"),
+        ("tree.depth", "==2", "==3"),
         ("tree.levels.1.nodes", "==3", "==4"),
         ("tree.levels.1.nodes", "!=4", "!=3"),
         ("tree.children.3", "==2", "==1"),
@@ -113,13 +122,44 @@ def test_a_path_that_the_report_has_not_is_an_error(tree: Report, way: str) -> N
         tree.value_at(way)
 
 
-def test_a_path_leads_to_a_value_of_the_report(tree: Report) -> None:
-    plain = tree.as_dict()
-    assert tree.value_at("tree.levels.0") == plain["tree"]["levels"][0]
-    assert tree.value_at("tree.levels.2.leaves") == 5
-    assert tree.value_at("tree.children.2") == 1
-    assert tree.value_at("values.box.min.2") == 1.0
-    assert tree.value_at("findings") is None
+@pytest.mark.parametrize(
+    ("arguments", "status", "out"),
+    [
+        ("TREE --assert lod==true", 0, ""),
+        ("TREE PLAIN --assert lod==true", 3, "PLAIN: error: expect.lod: lod==true: lod is false\n"),
+        ("ORPHAN --assert lod==true", 3, "ORPHAN: error: tree.orphan: node 9 has no parent\n"),
+        ("SINGLE --assert lod==true --fail-on warning", 0, ""),
+        ("SINGLE --assert lod==true --check --fail-on warning", 3, "SINGLE: warning: tree.single-child: "),
+        (
+            "TREE --leaves-of PLAIN",
+            3,
+            "TREE: error: expect.leaves: 6 leaves, but 60 splats of the original can be drawn\n",
+        ),
+        (
+            "PLAIN TREE --assert tree.depth==2",
+            3,
+            "PLAIN: error: expect.value: tree.depth==2: the report has no tree.depth",
+        ),
+        ("PLAIN --assert values.quantities.sh1.max<=9", 0, ""),
+        (
+            "PLAIN --assert values.box.min.0>=99",
+            3,
+            "PLAIN: error: expect.value: values.box.min.0>=99: values.box.min.0 is -",
+        ),
+    ],
+)
+def test_files_are_checked_with_their_expectations(arguments: str, status: int, out: str, capsys: Capture) -> None:
+    files = {
+        "TREE": TREE,
+        "PLAIN": PLAIN,
+        "ORPHAN": FIXTURES / "faults" / "tree-orphan.spz",
+        "SINGLE": FIXTURES / "faults" / "tree-single-child.spz",
+    }
+    assert run(["inspect", *(str(files.get(word, word)) for word in arguments.split())]) == status
+    for name, path in files.items():
+        out = out.replace(name, str(path))
+    found = capsys.readouterr().out
+    assert found.startswith(out) if out else not found
 
 
 def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: Capture) -> None:
@@ -127,11 +167,6 @@ def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: Capture) ->
     assert run(["convert", str(TREE), str(splats), "--leaves", "-q"]) == 0
     assert run(["inspect", str(TREE), "--leaves-of", str(splats)]) == 0
     assert capsys.readouterr().out == ""
-    assert run(["inspect", str(TREE), "--leaves-of", str(PLAIN)]) == 3
-    assert (
-        capsys.readouterr().out
-        == f"{TREE}: error: expect.leaves: 6 leaves, but 60 splats of the original can be drawn\n"
-    )
 
 
 @pytest.mark.parametrize("original", ["missing.ply", FIXTURES / "points.ply"])
@@ -140,37 +175,6 @@ def test_an_original_that_cannot_be_read_is_named(original: object, capsys: Capt
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith(f"error: {original}: ")
-
-
-def test_a_tree_can_be_required(capsys: Capture) -> None:
-    assert run(["inspect", str(TREE), "--assert", "lod==true"]) == 0
-    assert run(["inspect", str(TREE), str(PLAIN), "--assert", "lod==true"]) == 3
-    assert capsys.readouterr().out == f"{PLAIN}: error: expect.lod: lod==true: lod is false\n"
-
-
-def test_an_expectation_is_that_there_are_no_errors_either(capsys: Capture) -> None:
-    broken, warned = (FIXTURES / "faults" / f"{name}.spz" for name in ("tree-orphan", "tree-single-child"))
-    assert run(["inspect", str(broken), "--assert", "lod==true"]) == 3
-    assert capsys.readouterr().out == f"{broken}: error: tree.orphan: node 9 has no parent\n"
-    assert run(["inspect", str(warned), "--assert", "lod==true", "--fail-on", "warning"]) == 0
-    assert capsys.readouterr().out == ""
-    assert run(["inspect", str(warned), "--assert", "lod==true", "--check", "--fail-on", "warning"]) == 3
-    assert "tree.single-child" in capsys.readouterr().out
-
-
-def test_expected_values_are_computed_without_stats(tmp_path: Path, capsys: Capture) -> None:
-    path = written(tmp_path, "values.quantities.sh1.max<=9\nvalues.box.min.0>=99\n")
-    assert run(["inspect", str(PLAIN), "--expect", str(path)]) == 3
-    said = "values.box.min.0>=99: values.box.min.0 is -"
-    assert capsys.readouterr().out.startswith(f"{PLAIN}: error: expect.value: {said}")
-
-
-def test_a_path_missing_in_one_file_does_not_stop_the_others(tmp_path: Path, capsys: Capture) -> None:
-    path = written(tmp_path, "tree.depth==2")
-    assert run(["inspect", str(PLAIN), str(TREE), "--expect", str(path)]) == 3
-    out, err = capsys.readouterr()
-    assert "the report has no tree.depth" in out
-    assert f"{TREE}: OK: 9 nodes" in err
 
 
 def test_a_file_has_an_assertion_a_line(tmp_path: Path, tree: Report) -> None:
@@ -194,6 +198,7 @@ max_growth = 1.5
 [values]
 "tree.depth" = 2
 """
+
 OLD_JSON = '{"max_bytes": 1000, "min_splats":1, "max_splats": 10, "sh": 0, "lod": true, "max_growth": 1.5}'
 
 

@@ -1,4 +1,4 @@
-"""The facts of a tree against brute force, and what is found in it by hand."""
+"""The facts of a tree and its faults, against brute force and by hand."""
 
 from __future__ import annotations
 
@@ -153,21 +153,20 @@ def test_facts_of_a_small_tree_are_those_worked_out_by_hand() -> None:
     assert (facts.chunks, facts.chunks_of_coarse_cut) == (1, 1)
 
 
-def test_a_tree_of_one_node_has_facts() -> None:
-    facts, findings = examine(sized([1.0]), tree_of([(0, 0)]))
-    assert findings == []
-    assert (facts.leaves, facts.inner, facts.growth, facts.depth, facts.children) == (1, 0, 1.0, 0, {})
-
-
-def test_a_level_of_nodes_without_size_has_no_mean_size() -> None:
-    facts, _ = examine(sized([1.0, 0.0, 1.0]), tree_of([(2, 1), (0, 0), (0, 0)]))
-    assert [level.size for level in facts.levels] == [1.0, None]
-
-
-def test_a_tree_without_leaves_has_no_growth() -> None:
-    facts, findings = examine(sized([1.0, 1.0]), tree_of([(1, 1), (1, 0)]))
-    assert (facts.leaves, facts.growth) == (0, 2.0)
-    assert codes(findings) == {"tree.root", "tree.order", "tree.single-child"}
+@pytest.mark.parametrize(
+    ("sizes", "links", "leaves", "growth", "levels", "expected"),
+    [
+        ([1.0], [(0, 0)], 1, 1.0, [1.0], set()),
+        ([1.0, 0.0, 1.0], [(2, 1), (0, 0), (0, 0)], 2, 1.5, [1.0, None], set()),  # no mean of a size of 0
+        ([1.0, 1.0], [(1, 1), (1, 0)], 0, 2.0, [1.0, 1.0], {"tree.root", "tree.order", "tree.single-child"}),
+    ],
+)
+def test_facts_of_trees_without_edges_sizes_or_leaves(
+    sizes: list[float], links: Links, leaves: int, growth: float, levels: list[float | None], expected: set[str]
+) -> None:
+    facts, findings = examine(sized(sizes), tree_of(links))
+    assert (facts.leaves, facts.growth, [level.size for level in facts.levels]) == (leaves, growth, levels)
+    assert codes(findings) == expected
 
 
 def test_a_finding_counts_and_names_the_first() -> None:
@@ -218,13 +217,6 @@ def test_a_rise_is_found_although_a_node_has_no_parent() -> None:
     assert codes(findings) == {"tree.orphan", "tree.coarse-first"}
     (found,) = (each for each in findings if each.code == "tree.coarse-first")
     assert found.index == pytest.approx(1500, abs=3000 / facts_of.PARTS)
-
-
-@pytest.mark.parametrize("seed", range(30))
-def test_small_good_trees_give_no_finding(seed: int) -> None:
-    for base in (1.1, 1.5, 2.0):
-        nodes, tree = quick.build(random_splats(150 + 5 * seed, seed=seed), base)
-        assert examine(nodes, tree)[1] == []
 
 
 def test_good_trees_are_far_from_the_bounds() -> None:

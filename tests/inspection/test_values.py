@@ -1,4 +1,4 @@
-"""Statistics of values, and the columns of SPZ that a report reads."""
+"""Statistics of values, findings about them, and the columns of SPZ that a report reads."""
 
 from __future__ import annotations
 
@@ -8,22 +8,25 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
 
-from sparklod_cli.cli import run
-from sparklod_cli.codecs import ply, splat, spz
+from sparklod_cli.codecs import ply, spz
 from sparklod_cli.codecs.spz import ANTIALIASED, HEADER, LOD, MAGIC, Layout
-from sparklod_cli.inspection import values
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.values import (
+    LEVELS,
     MAIN,
     PERCENTILES,
     QUANTITIES,
+    Numbers,
     check,
     examine,
-    histogram_of,
     names_of,
     quantity,
 )
@@ -32,7 +35,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import COLUMNS, Splats
-from tests.conftest import FIXTURES, Capture
+from tests.conftest import FIXTURES
 from tests.scenes import random_splats
 
 NAN, INF = math.nan, math.inf
@@ -57,6 +60,7 @@ def three() -> Splats:
 
 #: Of each of the three. Size: twice the mean scale, and more where D is above 1.
 D_OF_2 = math.sqrt(1 + math.e * math.log(2))
+
 BY_HAND = {
     "x": [0, 1, 3],
     "y": [0, 10, -10],
@@ -82,16 +86,6 @@ def test_each_quantity_of_three_splats_is_as_worked_out_by_hand(name: str) -> No
     assert summary["p50"] == pytest.approx(sorted(BY_HAND[name])[1], rel=EXACT)
     assert summary["max"] == pytest.approx(max(BY_HAND[name]), rel=EXACT)
     assert summary["mean"] == pytest.approx(sum(BY_HAND[name]) / 3, rel=EXACT)
-
-
-def test_the_other_facts_of_three_splats_are_as_worked_out_by_hand() -> None:
-    facts = examine(three())
-    assert facts.box is not None
-    assert facts.box_98 is not None
-    assert (facts.box.min, facts.box.max) == ([0, -10, -5], [3, 10, 5])
-    assert facts.box_98.min == pytest.approx([0.02, -9.8, -4.9])  # a fiftieth of the way to the middle one
-    assert facts.box_98.max == pytest.approx([2.96, 9.8, 4.9])
-    assert (facts.non_finite, facts.zero_opacity, facts.zero_scale, facts.more_than_opaque) == (0, 0, 0, 1)
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -176,91 +170,118 @@ def test_numbers_at_the_end_of_what_floats_hold_can_be_printed() -> None:
     assert facts.box.max == pytest.approx([largest] * 3, rel=EXACT)
 
 
-def codes(splats: Splats, tree: LodTree | None = None, **header: int) -> list[str]:
-    return [found.code for found in check(Scene(splats, tree, header=header))]
+# --- Percentiles of numbers that come block by block ------------------------------------------------------------------
 
 
-def with_first(name: str, value: float, count: int = 20) -> Splats:
-    """A scene of which one number of the first splat is given."""
+def numbers_of(kind: str) -> st.SearchStrategy[np.ndarray]:
+    elements = arrays.from_dtype(np.dtype(kind), allow_nan=False, allow_infinity=False)
+    return arrays.arrays(kind, st.integers(1, 60), elements=elements | st.sampled_from([0.0, -0.0, 1.0, 1.5]))
+
+
+def summary_of(values: np.ndarray, limit: float, step: int, *, centred: bool = False) -> dict[str, float]:
+    numbers = Numbers(limit, centred=centred)
+    for start in range(0, len(values), step):
+        numbers.add(values[start : start + step])
+    assert numbers.count == np.isfinite(values).sum()
+    return numbers.summary()
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+@given(st.one_of(numbers_of("<f4"), numbers_of("<f8")), st.integers(1, 20))
+@example(np.array([-0.0, 0.0, 0.0], np.float32), 2)
+def test_percentiles_of_numbers_that_are_kept_are_those_of_numpy(values: np.ndarray, step: int) -> None:
+    found, wide = summary_of(values, len(values), step), values.astype(np.float64)
+    assert list(found) == [*LEVELS, "mean"]
+    for name, level in LEVELS.items():
+        assert found[name] == pytest.approx(np.percentile(wide, level), rel=6e-6, abs=1e-320)
+        assert found[name] or not np.signbit(found[name])  # no -0, whose place among zeros is not fixed
+    assert found["mean"] == pytest.approx(wide.mean(), rel=6e-6, abs=1e-9 * float(np.abs(wide).max()))
+
+
+@pytest.mark.parametrize("origin", [0, 500_000])
+@pytest.mark.parametrize("kind", ["<f4", "<f8"])
+def test_percentiles_of_more_numbers_are_off_by_less_than_a_hundredth(kind: str, origin: int) -> None:
+    rng = np.random.default_rng(0)
+    away = (rng.normal(size=5_000) * np.exp(rng.normal(size=5_000))).astype(np.float32)
+    away[:3] = np.nan, np.inf, -np.inf
+    values = (origin + away).astype(kind)
+    found, finite = summary_of(values, 100, 64, centred=True), values[np.isfinite(values)].astype(np.float64)
+    for name, level in LEVELS.items():
+        expected = np.percentile(finite, level)
+        assert found[name] == pytest.approx(expected, abs=0.009 * abs(expected - origin) + 5e-6 * abs(expected) + 2e-3)
+    assert found["mean"] == pytest.approx(finite.mean(), rel=1e-5)
+
+
+# --- Findings ---------------------------------------------------------------------------------------------------------
+
+
+def edited(count: int, name: str, at: Any, value: float) -> Splats:
+    """A scene with other numbers in one column."""
     splats = random_splats(count, sh_degree=1)
-    getattr(splats, name).reshape(count, -1)[0, 0] = value
+    getattr(splats, name)[at] = value
     return splats
 
 
 @pytest.mark.parametrize("name", COLUMNS)
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
 def test_a_number_that_is_not_finite_is_an_error_in_every_column(name: str, value: float) -> None:
-    splats = with_first(name, value)
-    finding = check(Scene(splats))[0]
+    finding = check(Scene(edited(20, name, 0, value)))[0]
     assert (finding.code, finding.index, finding.count) == ("values.non-finite", 0, 1)
 
 
-def test_an_opacity_out_of_range_is_an_error_where_there_is_no_tree() -> None:
+SPZ = {"version": 3, "fractional_bits": 12}
+#: The largest coordinate, and the smallest and largest scale, of the codes of such a file.
+FAR_END = (2**23 - 1) / 2**12
+SMALL, LARGE = (float(end) for end in np.exp(np.float32([-10, 255 / 16 - 10])))
+
+
+@pytest.mark.parametrize(
+    ("count", "name", "at", "value", "header", "expected"),
+    [
+        (20, "opacity", 0, 1.01, {}, "values.opacity"),
+        (20, "opacity", 0, -0.01, {}, "values.opacity"),
+        (20, "opacity", 0, 1.0, {}, ""),
+        (20, "opacity", slice(2), 0.0, {}, ""),  # a tenth is not many
+        (20, "opacity", slice(3), 0.0, {}, "values.invisible"),
+        (20, "scale", slice(2), 0.0, {}, ""),
+        (20, "scale", slice(3), 0.0, {}, "values.invisible"),
+        (20, "scale", (slice(20), 2), 0.0, {}, ""),  # flat splats can be drawn
+        *((20, "center", (0, 0), FAR_END, {**SPZ, "version": each}, "values.center-clamped") for each in (2, 3, 4)),
+        (20, "center", (0, 0), -FAR_END, SPZ, "values.center-clamped"),
+        (20, "center", (0, 0), FAR_END - 2**-12, SPZ, ""),
+        (20, "center", (0, 0), FAR_END, {**SPZ, "version": 1}, ""),  # which has floats
+        (20, "center", (0, 0), FAR_END, {}, ""),
+        (20, "center", (0, 0), 65_519.9, {}, ""),
+        (20, "center", (0, 0), 65_520.0, {}, "values.center-far"),
+        (20, "center", (0, 0), -1e7, {}, "values.center-far"),
+        (2_000, "scale", slice(2), SMALL, SPZ, ""),  # a thousandth is not many
+        (2_000, "scale", slice(3), SMALL, SPZ, "values.scale-clamped"),
+        (2_000, "scale", slice(2), LARGE, SPZ, "values.scale-clamped"),  # one splat of a sky may fill the picture
+        (2_000, "scale", slice(3), LARGE, {}, ""),
+        (200, "scale", (slice(200), 2), SMALL, SPZ, ""),  # thin splats
+        (200, "scale", (slice(100), 2), LARGE, SPZ, "values.scale-clamped"),
+    ],
+)
+def test_numbers_beyond_or_at_the_end_of_their_range_are_findings(
+    count: int, name: str, at: Any, value: float, header: dict[str, int], expected: str
+) -> None:
+    findings = check(Scene(edited(count, name, at, value), header=header))
+    assert [finding.code for finding in findings] == expected.split()
+
+
+def test_merged_splats_may_be_more_than_opaque() -> None:
     tree = LodTree(np.array([19] + [0] * 19, np.uint16), np.array([1] + [0] * 19, np.uint32))
-    assert codes(with_first("opacity", 1.01)) == codes(with_first("opacity", -0.01)) == ["values.opacity"]
-    assert codes(with_first("opacity", 1.0)) == codes(with_first("opacity", 0.001)) == []
-    assert codes(with_first("opacity", 900.0), tree) == []
-    assert codes(with_first("opacity", -0.01), tree) == ["values.opacity"]
+    assert check(Scene(edited(20, "opacity", 0, 900.0), tree)) == []
+    assert [finding.code for finding in check(Scene(edited(20, "opacity", 0, -0.01), tree))] == ["values.opacity"]
 
 
-@pytest.mark.parametrize("name", ["opacity", "scale"])
-def test_many_splats_that_cannot_be_drawn_are_a_finding(name: str) -> None:
-    splats = random_splats(20)
-    column = getattr(splats, name)
-    column[:2] = 0
-    assert codes(splats) == []  # a tenth is not many
-    column[10] = 0
-    (finding,) = check(Scene(splats))
-    assert (finding.code, finding.index, finding.count) == ("values.invisible", 0, 3)
-    assert "splat 0 and 2 more" in finding.message
+def test_a_finding_names_the_first_splat_and_counts_the_others() -> None:
+    (finding,) = check(Scene(edited(20, "opacity", [3, 7, 10], 0)))
+    assert (finding.code, finding.index, finding.count) == ("values.invisible", 3, 3)
+    assert "splat 3 and 2 more" in finding.message
 
 
-def test_a_scale_of_0_along_one_axis_can_be_drawn() -> None:
-    splats = random_splats(20)
-    splats.scale[:, 2] = 0
-    assert codes(splats) == []
-
-
-@pytest.mark.parametrize("version", [1, 2, 3, 4])
-@pytest.mark.parametrize("sign", [1, -1])
-def test_centres_at_the_end_of_the_fixed_point_are_a_finding(version: int, sign: int) -> None:
-    """Version 1 has floats; and without a header nothing is known of codes."""
-    end = (2**23 - 1) / 2**12
-    at_end, inside = with_first("center", sign * end), with_first("center", sign * (end - 2**-12))
-    expected = ["values.center-clamped"] if version > 1 else []
-    assert codes(at_end, version=version, fractional_bits=12) == expected
-    assert codes(inside, version=version, fractional_bits=12) == []
-    assert codes(at_end, version=version) == codes(at_end) == []
-
-
-def test_many_scales_at_the_ends_of_their_code_are_a_finding() -> None:
-    header = {"version": 3, "fractional_bits": 12}
-    for end in np.exp(np.float32([-10, 255 / 16 - 10])):
-        splats = random_splats(2_000)
-        splats.scale[:2] = end
-        large = bool(end > 1)  # one of a sky may fill the picture; of others, a thousandth is not many
-        assert codes(splats, **header) == ["values.scale-clamped"] * large
-        splats.scale[7] = end
-        assert codes(splats, **header) == ["values.scale-clamped"]
-        assert codes(splats) == []
-
-
-def test_thin_splats_at_the_end_of_their_code_are_no_finding() -> None:
-    splats = random_splats(200)
-    splats.scale[:, 2] = np.exp(np.float32(-10))
-    assert codes(splats, version=3, fractional_bits=12) == []
-    splats.scale[:100, 2] = np.exp(np.float32(255 / 16 - 10))
-    assert codes(splats, version=3, fractional_bits=12) == ["values.scale-clamped"]
-
-
-@pytest.mark.parametrize(("far", "found"), [(65_519.9, False), (65_520.0, True), (-1e7, True)])
-def test_centres_beyond_float16_are_a_finding(far: float, found: bool) -> None:
-    assert codes(with_first("center", far)) == ["values.center-far"] * found
-    with np.errstate(over="ignore"):
-        assert bool(np.isinf(np.float32(far).astype(np.float16))) == found
-
-
-def test_the_bounds_are_said_of_scenes_as_they_are_written(tmp_path: Path) -> None:
+def test_scenes_are_checked_as_they_are_written(tmp_path: Path) -> None:
     """A scene that does not fit its code, through the codec and back."""
     splats = random_splats(50)
     splats.scale[:10] = 1e-6
@@ -270,97 +291,6 @@ def test_the_bounds_are_said_of_scenes_as_they_are_written(tmp_path: Path) -> No
     assert [(found.code, found.count) for found in report.findings or []] == [("values.scale-clamped", 10)]
     path.write_bytes(b"".join(ply.encode(Scene(splats))))
     assert inspect(path, ReportSettings(check=True))[0].findings == []
-
-
-@pytest.mark.parametrize("count", [1, 2, 1000])
-def test_values_of_files_are_those_of_what_was_written(count: int, tmp_path: Path) -> None:
-    splats = random_splats(count, seed=count)
-    path = tmp_path / "scene.splat"
-    path.write_bytes(b"".join(splat.encode(Scene(splats))))
-    report, scene = inspect(path, ReportSettings(values=True, all_quantities=True))
-    assert report.values is not None
-    assert scene is not None
-    assert report.values == examine(scene.splats, all_quantities=True)
-    opacity = report.values.quantities["opacity"]
-    assert opacity["mean"] == pytest.approx(splats.opacity.mean(dtype=np.float64), abs=1 / 255)
-    assert report.bytes == 32 * count
-    assert (report.bytes_per_splat, report.compression_ratio) == (32.0, 1.75)
-
-
-def test_every_quantity_is_a_field_of_the_command_line(tmp_path: Path, capsys: Capture) -> None:
-    path = tmp_path / "scene.ply"
-    path.write_bytes(b"".join(ply.encode(Scene(random_splats(10, sh_degree=2)))))
-    for name in values.names_of(random_splats(1, sh_degree=2)):
-        assert run(["inspect", str(path), "--field", f"values.quantities.{name}.p50"]) == 0
-        assert math.isfinite(float(capsys.readouterr().out))
-
-
-def test_a_histogram_of_a_quantity_counts_every_splat() -> None:
-    splats = random_splats(200)
-    splats.opacity[0] = 1e-3
-    assert not histogram_of(splats, "opacity").log
-    assert histogram_of(splats, "scale", bins=10).counts.sum() == 200
-
-
-SETTINGS = [
-    ReportSettings(),
-    ReportSettings(values=True),
-    ReportSettings(check=True),
-    ReportSettings(chunks=True, values=True, all_quantities=True, check=True),
-]
-FILES = sorted([*(FIXTURES / "golden").glob("*.spz"), *(FIXTURES / "faults").glob("*.spz")])
-
-
-def check_both(path: Path) -> None:
-    for settings in SETTINGS:
-        expected, _ = inspect(path, replace(settings, at_once=True), threads=2)
-        for threads in (1, 3):
-            found, scene = inspect(path, settings, threads=threads)
-            assert repr(found) == repr(expected)  # NaN differs from itself
-            assert scene is None
-
-
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_of_sound_and_of_broken_files(path: Path) -> None:
-    check_both(path)
-
-
-def random_file(version: int, *, flags: int, count: int = 300, links: int = 0) -> bytes:
-    """A file of any codes; its links lead anywhere up to `links`."""
-    rng = np.random.default_rng(version)
-    layout = Layout(version, count, 2, 12, flags)
-    data = HEADER.pack(MAGIC, version, count, 2, 12, flags, 0)
-    for stream in layout.streams():
-        codes = rng.integers(0, 256, (count, stream.size), np.uint8)
-        if stream.name.startswith("child"):
-            kind = "<u2" if stream.size == 2 else "<u4"
-            codes = rng.integers(0, links, count).astype(kind).view(np.uint8)
-        data += codes.tobytes()
-    return gzip.compress(data, 1)
-
-
-@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # any bits are numbers
-@pytest.mark.parametrize("flags", [0, ANTIALIASED, LOD])
-@pytest.mark.parametrize("version", [1, 2, 3])
-def test_of_any_codes(version: int, flags: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparklod_cli.inspection.blocks.CHUNK_NODES", 64)
-    path = tmp_path / "any.spz"
-    path.write_bytes(random_file(version, flags=flags, links=5))
-    check_both(path)
-
-
-@pytest.mark.parametrize("version", [1, 2, 3])
-@pytest.mark.parametrize("flags", [0, LOD])
-def test_no_code_but_positions_of_version_1_stands_for_an_invalid_splat(
-    version: int, flags: int, tmp_path: Path
-) -> None:
-    path = tmp_path / "any.spz"
-    path.write_bytes(random_file(version, flags=flags, count=40_000, links=1))
-    splats = read_scene(path, validate=False).splats
-    assert set(splats.invalid()) == ({"non_finite"} if version == 1 else set())
-    splats = replace(splats, center=np.zeros_like(splats.center))
-    assert splats.invalid() == {}
 
 
 @pytest.mark.parametrize(
@@ -383,3 +313,68 @@ def test_a_check_hints_at_the_layout_of_spark_that_loses_less(
     assert report.findings == []
     assert all(("pagedExtSplats of" in each) == (sh_degree < 3) for each in report.hints if "clamp" in each)
     assert inspect(tmp_path / "scene.ply", ReportSettings())[0].hints == []
+
+
+# --- Files ------------------------------------------------------------------------------------------------------------
+
+
+SETTINGS = [
+    ReportSettings(),
+    ReportSettings(values=True),
+    ReportSettings(check=True),
+    ReportSettings(chunks=True, values=True, all_quantities=True, check=True),
+]
+FILES = sorted([*(FIXTURES / "golden").glob("*.spz"), *(FIXTURES / "faults").glob("*.spz")])
+
+
+def check_columns(path: Path) -> None:
+    """Compare reports from some columns, on several threads, with the report from the whole scene."""
+    for settings in SETTINGS:
+        expected, _ = inspect(path, replace(settings, at_once=True), threads=2)
+        for threads in (1, 3):
+            found, scene = inspect(path, settings, threads=threads)
+            assert repr(found) == repr(expected)  # NaN differs from itself
+            assert scene is None
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_columns_of_spz_give_the_report_of_the_whole_file(path: Path) -> None:
+    check_columns(path)
+
+
+def random_file(version: int, *, flags: int, count: int = 300, links: int = 0) -> bytes:
+    """A file of any codes; its links lead anywhere up to `links`."""
+    rng = np.random.default_rng(version)
+    layout = Layout(version, count, 2, 12, flags)
+    data = HEADER.pack(MAGIC, version, count, 2, 12, flags, 0)
+    for stream in layout.streams():
+        codes = rng.integers(0, 256, (count, stream.size), np.uint8)
+        if stream.name.startswith("child"):
+            kind = "<u2" if stream.size == 2 else "<u4"
+            codes = rng.integers(0, links, count).astype(kind).view(np.uint8)
+        data += codes.tobytes()
+    return gzip.compress(data, 1)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # any bits are numbers
+@pytest.mark.parametrize("flags", [0, ANTIALIASED, LOD])
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_columns_of_any_codes(version: int, flags: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sparklod_cli.inspection.blocks.CHUNK_NODES", 64)
+    path = tmp_path / "any.spz"
+    path.write_bytes(random_file(version, flags=flags, links=5))
+    check_columns(path)
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize("flags", [0, LOD])
+def test_no_code_but_positions_of_version_1_stands_for_an_invalid_splat(
+    version: int, flags: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "any.spz"
+    path.write_bytes(random_file(version, flags=flags, count=40_000, links=1))
+    splats = read_scene(path, validate=False).splats
+    assert set(splats.invalid()) == ({"non_finite"} if version == 1 else set())
+    splats = replace(splats, center=np.zeros_like(splats.center))
+    assert splats.invalid() == {}

@@ -1,4 +1,4 @@
-"""The cache of compiled kernels survives what happens to files."""
+"""The cache of compiled kernels: whom it trusts, and damage, full disks and folders that vanish."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from sparklod_cli.warmup import units
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.slow
+
+# --- Files of the cache -----------------------------------------------------------------------------------------------
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
     "empty": lambda content: b"",
@@ -101,6 +103,19 @@ print(kernel_cache.start_of(fast_math.exp2.py_func))
     assert start() != start("another")
 
 
+# --- Trust ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
+    given = cache_folders(Path(jit.__file__))[0]
+    assert given is not None
+    assert given.parent == tmp_path / "given"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/no/folder")
+    assert cache_folders(Path(jit.__file__)) == (None, (), ())
+    assert cache_folders(Path(jit.__file__).parent / "not-there.py") == (None, (), ())  # as in a zip
+
+
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 
 
@@ -178,6 +193,9 @@ def test_a_folder_that_cannot_be_written_is_read_only(tmp_path: Path, monkeypatc
     assert folder is not None
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert cache_folders(Path(jit.__file__)) == (None, (folder,), ())
+
+
+# --- Damage -----------------------------------------------------------------------------------------------------------
 
 
 def test_memory_that_runs_out_is_no_damage(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:

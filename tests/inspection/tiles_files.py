@@ -1,33 +1,17 @@
-"""Every rule of 3D Tiles that a folder breaks is found by its code, and by no other; sound ones have none."""
+"""Folders of 3D Tiles written without sparklod whose tilesets can be changed, and a table of faulty ones."""
 
 from __future__ import annotations
 
 import copy
-import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pytest
-
 from fixtures import by_hand_glb, by_hand_tiles
-from sparklod_cli.codecs import tiles_3d as codec
-from sparklod_cli.codecs import tileset as tilesets
 from sparklod_cli.codecs.gltf_container import TURNS
-from sparklod_cli.codecs.options import PROFILES, WriteOptions
-from sparklod_cli.codecs.tileset import ERRORS, WARNINGS
-from sparklod_cli.inspection.report import Report, ReportSettings, inspect
-from sparklod_cli.io.writing import parts_output
-from sparklod_cli.lod import quality
-from sparklod_cli.lod.parts import make_tiles
-from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from tests.codecs.cases import linear
-from tests.conftest import FIXTURES
-from tests.inspection.test_schema import faults as schema_faults
-from tests.outputs import write_files
 from tests.scenes import random_splats
 
 Node = dict[str, Any]
@@ -85,9 +69,19 @@ def up(axis: str) -> bytes:
     return by_hand_glb.glb(**columns(20), asset=asset, nodes=[{"mesh": 0, "rotation": TURNS[axis]}])
 
 
+def write(files: Files, path: Path) -> Path:
+    for name, data in files.items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(data)
+    return path / "tileset.json"
+
+
+# --- Faults -----------------------------------------------------------------------------------------------------------
+
 NAMES = {"extensionsUsed": ["KHR_gaussian_splatting"]}
 LEAF = "tiles/1-1.glb"
 
+#: Folders with faults, and the codes of their findings; those without a dot begin with "tiles.".
 FAULTS: dict[str, tuple[Files, set[str]]] = {
     "another version": (top(asset={"version": "2"}), {"container.version"}),
     "no asset": (top(asset=None), {"container.corrupt"}),
@@ -156,67 +150,3 @@ FAULTS: dict[str, tuple[Files, set[str]]] = {
     "a tile of nothing": (leaf(content=None), {"empty"}),
     "children that are fewer": (folder(60, 20, 25), {"decreasing"}),
 }
-
-
-def write(files: Files, path: Path) -> Path:
-    for name, data in files.items():
-        (path / name).parent.mkdir(parents=True, exist_ok=True)
-        (path / name).write_bytes(data)
-    return path / "tileset.json"
-
-
-def checked(path: Path) -> Report:
-    return inspect(path, ReportSettings(check=True))[0]
-
-
-def codes(path: Path) -> list[str]:
-    return [found.code.removeprefix("tiles.") for found in checked(path).findings or []]
-
-
-@pytest.mark.parametrize("name", FAULTS)
-def test_each_fault_is_found_by_its_code_and_no_other(name: str, tmp_path: Path) -> None:
-    files, expected = FAULTS[name]
-    path = write(files, tmp_path)
-    found = codes(path)
-    assert len(found) == len(set(found))
-    assert set(found) == expected, checked(path).findings
-    assert schema_faults(checked(path).as_dict()) == []
-
-
-def test_every_code_of_the_rules_has_a_fault() -> None:
-    planted = {f"tiles.{code}" for _, expected in FAULTS.values() for code in expected if "." not in code}
-    assert {*ERRORS, *WARNINGS} - planted == {"tiles.large"}  # see below
-
-
-def test_large_tiles_are_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tilesets, "LARGE", 29)
-    assert codes(write(SOUND, tmp_path)) == ["large"]
-
-
-@pytest.mark.parametrize("files", [SOUND, folder(5, 6), root(transform=[*np.eye(4).ravel()[:12], 9e6, 0, 0, 1])])
-def test_sound_folders_have_no_findings(files: Files, tmp_path: Path) -> None:
-    write(files, tmp_path)
-    assert codes(tmp_path) == []
-
-
-def test_the_golden_file_has_no_findings() -> None:
-    assert codes(FIXTURES / "golden" / "sh1-tiles") == []
-
-
-@pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("up", [None, "y", "-y", "z"])
-def test_what_we_write_has_no_findings(up: str | None, profile: str, tmp_path: Path) -> None:
-    made = make_tiles(
-        *quality.build(random_splats(2_000, sh_degree=1), 2.0), TileSettings(tile_splats=60, lat=-33, lon=151)
-    )
-    made = dataclasses.replace(made, up=up)
-    path = tmp_path / "tileset.json"
-    files = codec.encode_files(made, WriteOptions(glb_profile=profile), most_tiles=40)
-    size = write_files(parts_output(path, overwrite=False), files)
-    report = checked(path)
-    assert report.findings == []
-    assert (report.bytes, report.up, report.splats) == (size, up, 2_000)
-    assert report.value_at("tiles.tiles") == made.tiles and report.value_at("tiles.tilesets") > 1
-    assert report.value_at("tiles.georeference.latitude") == pytest.approx(-33)
-    assert report.value_at("tiles.levels.0.splats") == made.counts[0]
-    assert schema_faults(report.as_dict()) == []

@@ -1,13 +1,9 @@
-"""`sparklod warmup`: afterwards nothing is left to compile."""
+"""`sparklod warmup` compiles every kernel; while a command runs, a second process compiles what it will need."""
 
 from __future__ import annotations
 
-import ast
-import importlib
-import itertools
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -22,8 +18,8 @@ from sparklod_cli.codecs.kernels import drawable, texels
 from sparklod_cli.commands.console import Console
 from sparklod_cli.lod.kernels import sort
 from sparklod_cli.system import jit
-from sparklod_cli.system.kernel_cache import start_of, stem_of
-from sparklod_cli.warmup import Unit
+from sparklod_cli.system.kernel_cache import stem_of
+from sparklod_cli.warmup import JOBS, CompileAhead, Unit
 from tests.conftest import FIXTURES, ROOT
 
 #: Runs command lines of JSON one after the other; prints their exit statuses, and the kernels that were compiled.
@@ -35,49 +31,6 @@ compiled = []
 jit.listeners.append((compiled.append, lambda seconds: None, compiled.append))
 print(json.dumps([[run(command) for command in json.loads(sys.argv[1])], compiled]))
 """
-
-PACKAGE = ROOT / "sparklod_cli"
-
-
-def kernels_in(path: Path) -> set[jit.Kernel]:
-    """The kernels that a module of the package imports or uses as attributes of modules of kernels."""
-    package = path.relative_to(ROOT).with_suffix("").parts[:-1]
-    found, nodes = set(), list(ast.walk(ast.parse(path.read_text())))
-    attributes = [node for node in nodes if isinstance(node, ast.Attribute)]
-    uses = [(node.value.id, node.attr) for node in attributes if isinstance(node.value, ast.Name)]
-    for node in nodes:
-        if not (isinstance(node, ast.ImportFrom) and node.level and "kernels" in (node.module or "").split(".")):
-            continue
-        module = ".".join([*package[: len(package) + 1 - node.level], str(node.module)])
-        for alias in node.names:
-            name = alias.asname or alias.name
-            if module.endswith(".kernels"):
-                members = vars(importlib.import_module(f"{module}.{alias.name}"))
-                found |= {members.get(attribute) for of, attribute in uses if of == name}
-            else:
-                found.add(getattr(importlib.import_module(module), alias.name))
-    return {each for each in found if isinstance(each, jit.Kernel)}
-
-
-def kernels_of_functions(path: Path) -> set[jit.Kernel]:
-    """The kernels that the plain functions of a module of kernels use."""
-    members = vars(importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts)))
-    functions = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef)]
-    nodes = itertools.chain.from_iterable(ast.walk(each) for each in functions if not each.decorator_list)
-    found = [members.get(node.id) for node in nodes if isinstance(node, ast.Name)]
-    return {each for each in found if isinstance(each, jit.Kernel)}
-
-
-def test_every_kernel_that_the_package_calls_declares_its_types_and_no_other() -> None:
-    called: set[jit.Kernel] = set()
-    for path in PACKAGE.rglob("*.py"):
-        if path.parent.name == "cuda":  # those are compiled for cards, which need no types for the processor
-            continue
-        called |= (kernels_of_functions if path.parent.name == "kernels" else kernels_in)(path)
-    declared = {unit.kernel for unit in warmup.units()}
-    assert sorted(stem_of(kernel.py_func) for kernel in called) == sorted(
-        stem_of(kernel.py_func) for kernel in declared
-    )
 
 
 def test_a_call_with_types_that_are_not_declared_fails_in_tests() -> None:
@@ -179,15 +132,77 @@ def test_the_children_import_nothing_from_the_working_directory(
     assert warmup.warm_up(processes=1) == len(few)
 
 
-@pytest.mark.slow
-def test_the_tests_say_that_they_compile(tmp_path: Path) -> None:
-    assert jit.CACHE_FOLDER is not None
-    ignore = shutil.ignore_patterns(f"{start_of(texels.look_up_words.py_func)}*")
-    shutil.copytree(jit.CACHE_FOLDER, tmp_path / jit.CACHE_FOLDER.name, ignore=ignore)
-    line = [sys.executable, "-m", "pytest", "tests/system/test_units.py", "-q", "-p", "no:cacheprovider"]
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    how: dict[str, Any] = {"cwd": ROOT, "capture_output": True, "text": True, "check": True, "env": environment}
-    said = subprocess.run([*line, "-n1"], **how).stdout
-    assert "compiling 1 kernel for this machine" in said
-    assert "compiled 1 kernel in " in said
-    assert "ompil" not in subprocess.run(line, **how).stdout
+# --- Compiling ahead --------------------------------------------------------------------------------------------------
+
+#: A command that does each job.
+COMMANDS = {
+    "quick": ["build-lod", "{scene}", "-o", "{out}/a.spz"],
+    "quality": ["build-lod", "{scene}", "--method", "quality", "-o", "{out}/a.spz"],
+    "chunks": ["build-lod", "{scene}", "-o", "{out}/a.rad"],
+    "levels": ["build-lod", "{scene}", "-o", "{out}/lod-meta.json"],
+    "fit": ["build-lod", "{scene}", "--refine", "2", "-o", "{out}/a.spz"],
+    "cuts": ["traverse", "{tree}", "--orbit", "2", "--budget", "10%"],
+    "pictures": ["render", "{tree}", "--budget", "10%", "--size", "64x64", "-o", "{out}/a.png"],
+}
+
+
+@pytest.mark.parametrize("job", JOBS)
+def test_a_command_calls_all_kernels_of_its_job(job: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    called, call = set[str](), jit.Kernel.__call__
+
+    def noted(kernel: jit.Kernel, *arguments: Any) -> Any:
+        called.add(stem_of(kernel.py_func))
+        return call(kernel, *arguments)
+
+    monkeypatch.setattr(jit.Kernel, "__call__", noted)
+    places = {"scene": FIXTURES / "demo.ply", "tree": FIXTURES / "golden" / "tree-v3.spz", "out": tmp_path}
+    line = [part.format(**places) for part in COMMANDS[job]]
+    assert run([*line, "--quiet"]) == 0
+    assert set(JOBS[job]) <= called
+
+
+@pytest.fixture
+def several_processors(few: list[Unit], monkeypatch: pytest.MonkeyPatch) -> list[Unit]:
+    """Three kernels that are missing are a job, on a machine of two processors."""
+    monkeypatch.setitem(JOBS, "few", tuple(dict.fromkeys(unit.name for unit in few)))
+    monkeypatch.setattr(warmup, "processors", lambda: 2)
+    return few
+
+
+def test_kernels_that_are_not_claimed_are_compiled_by_another_process(several_processors: list[Unit]) -> None:
+    mine = several_processors[0]
+    ahead = CompileAhead(several_processors, ["few"], "drawable.count_doubtful")
+    try:
+        ahead.claim(mine.kernel)  # as Python calls it, before the other process has come to it, or after
+        others = {unit.name for unit in several_processors} - {mine.name, "drawable.count_doubtful"}
+        for unit in several_processors:
+            if unit.name in others:
+                ahead.claim(unit.kernel)
+        left = {unit.name for unit in warmup.missing()}
+        assert "drawable.count_doubtful" in left
+    finally:
+        ahead.close()
+    assert jit.before_first_call is None
+    assert ahead.compiled == len(several_processors) - len(warmup.missing())
+
+
+def test_a_kernel_that_is_being_compiled_is_waited_for(several_processors: list[Unit]) -> None:
+    ahead = CompileAhead(several_processors, ["few"], "")
+    with ahead._changed:
+        ahead._changed.wait_for(lambda: ahead._current is not None)
+        unit = ahead._current
+    assert unit is not None
+    ahead.claim(unit.kernel)
+    assert unit.is_cached
+    ahead.close()
+
+
+@pytest.mark.parametrize("job", [[], ["few"]])
+def test_one_processor_or_no_job_needs_no_process(
+    job: list[str], several_processors: list[Unit], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(warmup, "processors", lambda: 1 if job else 2)
+    ahead = CompileAhead(several_processors, job, "")
+    ahead.close()
+    assert ahead.compiled == 0
+    assert len(warmup.missing()) == len(several_processors)

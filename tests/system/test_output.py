@@ -1,4 +1,4 @@
-"""Files that belong together: all of them appear or none, whatever happens on the way."""
+"""Outputs appear whole or not at all, alone or together, after errors, interrupts and kills at any step."""
 
 from __future__ import annotations
 
@@ -24,10 +24,137 @@ from tests.outputs import write_files
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 
+
+def has_unnamed_files(folder: Path) -> bool:
+    with contextlib.closing(output.NewFile(folder / "out", overwrite=False)) as new:
+        return new.part is None
+
+
+@pytest.fixture(params=[True, False], ids=["unnamed", "named"])
+def unnamed(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Whether files have no name before they are complete."""
+    if not request.param:
+        monkeypatch.setattr(output, "UNNAMED", None)
+    elif not has_unnamed_files(tmp_path):
+        pytest.skip("no files without names here")
+    output.sweep.cache_clear()
+    return bool(request.param)
+
+
+@pytest.fixture(autouse=True)
+def first_run() -> None:
+    """As in a new process, nothing has been swept yet."""
+    output.sweep.cache_clear()
+
+
+def refuse_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file system without hard links."""
+
+    def refused(*args: object, **how: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refused)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+# --- One file ---------------------------------------------------------------------------------------------------------
+
+
+def test_files_of_running_processes_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(output, "UNNAMED", None)
+    target = tmp_path / "out"
+
+    def pieces() -> Iterator[bytes]:
+        yield b"outer"
+        before = names(tmp_path)
+        assert len(before) == 1
+        output.sweep.cache_clear()
+        output.write_atomically(tmp_path / "other", [b"inner"], overwrite=False)
+        assert names(tmp_path) == sorted([*before, "other"])
+
+    output.write_atomically(target, pieces(), overwrite=False)
+    assert names(tmp_path) == ["other", "out"]
+    assert target.read_bytes() == b"outer"
+
+
+def test_only_files_of_dead_processes_are_removed(tmp_path: Path, unnamed: bool) -> None:
+    left = tmp_path / output.PARTS.format("0123456789abcdef")
+    left.write_bytes(b"half a")
+    kept = [tmp_path / name for name in (".sparklod-notes.txt", "a.part", ".sparklod-link.part", ".sparklod-dir.part")]
+    for path in kept[:2]:
+        path.write_bytes(b"precious")
+    kept[2].symlink_to(kept[1])
+    kept[3].mkdir()
+    output.write_atomically(tmp_path / "out", [b"x"], overwrite=False)
+    assert names(tmp_path) == sorted(["out", *(path.name for path in kept)])
+    assert kept[1].read_bytes() == b"precious"
+
+
+def modes_of_parts(folder: Path) -> list[int]:
+    """Permissions of all files of a folder that are not complete, with names or without."""
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in folder.glob(output.PARTS.format("*"))]
+    for number in output.OPEN_FILES.iterdir() if output.OPEN_FILES.exists() else ():
+        with contextlib.suppress(OSError):
+            about = number.stat()
+            if not about.st_nlink and str(number.readlink()).startswith(str(folder)):
+                modes.append(stat.S_IMODE(about.st_mode))
+    return modes
+
+
+@pytest.mark.parametrize("mask", [0o022, 0o077, 0o002])
+@pytest.mark.parametrize("before", [None, 0o600, 0o640, 0o666, 0o444, 0o6755, 0o1777])
+def test_no_part_has_more_permissions_than_the_file(
+    before: int | None, mask: int, unnamed: bool, tmp_path: Path
+) -> None:
+    target = tmp_path / "out"
+    if before is not None:
+        target.write_bytes(b"old")
+        target.chmod(before)
+    final = 0o666 & ~mask if before is None else before & 0o777  # nothing runs as somebody else because of us
+    seen: list[int] = []
+
+    def pieces() -> Iterator[bytes]:
+        yield b"new"
+        seen.extend(modes_of_parts(tmp_path))
+
+    umask = os.umask(mask)
+    try:
+        output.write_atomically(target, pieces(), overwrite=True)
+    finally:
+        os.umask(umask)
+    assert len(seen) == 1
+    assert seen[0] & ~final == 0
+    assert stat.S_IMODE(target.stat().st_mode) == final
+    assert target.read_bytes() == b"new"
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_files_are_written_without_hard_links(
+    overwrite: bool, unnamed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse_links(monkeypatch)
+    target = tmp_path / "out"
+    if overwrite:
+        target.write_bytes(b"old")
+    assert output.write_atomically(target, [b"a" * 3_000_000, b"b"], overwrite=overwrite) == 3_000_001
+    assert target.read_bytes() == b"a" * 3_000_000 + b"b"
+    with pytest.raises(FileExistsError):
+        output.write_atomically(target, [b"c"], overwrite=False)
+    assert names(tmp_path) == ["out"]
+
+
+# --- Files that belong together ---------------------------------------------------------------------------------------
+
 #: Chunks and what names them, as they were and as they are to be.
 OLD = {"a-0": b"old 0", "a-1": b"old 1", "a-2": b"old 2", "a": b"old"}
 NEW = {"a-0": b"new 0", "a-1": b"new 1", "a": b"new"}
 OTHERS = {"b-0": b"precious", "a-9": b"precious"}
+
+#: What a former header names.
+FORMER = list(OLD)[:-1]
 
 
 def files(content: dict[str, bytes]) -> Iterable[tuple[str, Iterable[bytes]]]:
@@ -43,10 +170,6 @@ def write(
     if not any("/" in name for name in former):
         siblings = Siblings(siblings.is_member, named=siblings.named)
     return write_files(Output(folder / "a", overwrite=overwrite, siblings=siblings), content)
-
-
-#: What a former header names.
-FORMER = list(OLD)[:-1]
 
 
 def put(folder: Path, *contents: dict[str, bytes]) -> None:
@@ -66,17 +189,12 @@ def held(folder: Path) -> dict[str, bytes]:
     }
 
 
-@pytest.fixture(autouse=True)
-def first_run() -> None:
-    output.sweep.cache_clear()
-
-
 def test_files_appear_together(tmp_path: Path) -> None:
     seen: list[set[str]] = []
 
     def some() -> Iterator[tuple[str, Iterable[bytes]]]:
         for each in files(NEW):
-            seen.append({path.name for path in tmp_path.iterdir() if not path.name.startswith(".sparklod-")})
+            seen.append({name for name in names(tmp_path) if not name.startswith(".sparklod-")})
             yield each
 
     assert write(tmp_path, some(), overwrite=False) == sum(map(len, NEW.values()))
@@ -199,11 +317,7 @@ def test_an_error_or_interrupt_at_any_step_leaves_what_was_there(
     step: tuple[object, str], existing: bool, after: bool, links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not links:
-
-        def refused(*args: object, **how: object) -> None:
-            raise PermissionError(1, "Operation not permitted")
-
-        monkeypatch.setattr(os, "link", refused)
+        refuse_links(monkeypatch)
     reached = broken_off(step, after, tmp_path, monkeypatch, OLD if existing else {}, NEW, OTHERS, FORMER)
     expected = {("rename", True): 4, ("replace", True): 3, ("chmod", True): 3, ("link", False): 3}
     assert reached == (3 if not links and step[1] == "replace" else expected.get((step[1], existing), 0))
@@ -213,8 +327,6 @@ def test_an_error_or_interrupt_at_any_step_leaves_what_was_there(
 OLD_FOLDERS = {"0/x": b"old 0x", "0/y": b"old 0y", "1/x": b"old 1x", "3/x": b"old 3x", "a": b"old"}
 NEW_FOLDERS = {"0/x": b"new 0x", "2/x": b"new 2x", "a": b"new"}
 OTHER_FOLDERS = {"3/notes": b"precious", "4/x": b"precious"}
-
-
 FORMER_FOLDERS = list(OLD_FOLDERS)[:-1]
 
 
@@ -323,49 +435,91 @@ def test_the_folder_of_a_running_process_is_left_alone(tmp_path: Path) -> None:
     assert held(tmp_path) == NEW | {"other": b"inner"}
 
 
-def test_a_folder_swept_before_it_is_locked_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("together", [False, True])
+def test_a_part_or_folder_swept_before_it_is_locked_is_made_again(
+    together: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not together:
+        monkeypatch.setattr(output, "UNNAMED", None)
     lock = output.lock
     rounds: list[int] = []
 
     def late(descriptor: int) -> None:
         if not rounds:
-            next(tmp_path.iterdir()).rmdir()
+            (part,) = tmp_path.iterdir()
+            part.rmdir() if part.is_dir() else part.unlink()
         rounds.append(descriptor)
         lock(descriptor)
 
     monkeypatch.setattr(output, "lock", late)
-    write(tmp_path, files(NEW), overwrite=False)
+    if together:
+        write(tmp_path, files(NEW), overwrite=False)
+    else:
+        output.write_atomically(tmp_path / "a", [b"x"], overwrite=False)
     assert len(rounds) == 2
-    assert held(tmp_path) == NEW
+    assert held(tmp_path) == (NEW if together else {"a": b"x"})
 
 
-#: Replaces a set by another one for ever; all of its files say which they belong to.
+# --- Writers that are killed ------------------------------------------------------------------------------------------
+
+#: Writes until it is killed: new files, or the same files again and again, all of which say which round they are of.
 WRITER = """
 import itertools, pathlib, sys
-from sparklod_cli.system.output import Output, Siblings
-siblings = Siblings(lambda name: name != "a")
-folder = pathlib.Path(sys.argv[1])
+from sparklod_cli.system import output
+folder, unnamed, overwrite = pathlib.Path(sys.argv[1]), sys.argv[2] == "True", sys.argv[3] == "True"
+if not unnamed:
+    output.UNNAMED = None
+siblings = output.Siblings(lambda name: name != "a")
 print("ready", flush=True)
 for number in itertools.count():
-    text = [str(number).encode() * 1000]
-    with Output(folder / "a", overwrite=True, siblings=siblings) as out:
-        for name in ("a-0", "a-1", "a-2", "a"):
-            out.write(name, text)
+    {write}
 """
+WRITE_ONE = """name = "out" if overwrite else f"out-{number}"
+    output.write_atomically(folder / name, [bytes([number % 256]) * 100_000] * 4, overwrite=overwrite)"""
+WRITE_SET = """with output.Output(folder / "a", overwrite=True, siblings=siblings) as out:
+        for name in ("a-0", "a-1", "a-2", "a"):
+            out.write(name, [str(number).encode() * 1000])"""
+
+
+def kill_writers(write: str, folder: Path, *, unnamed: bool = True, overwrite: bool = True) -> Iterator[None]:
+    """Start a writer 12 times and kill it at a random moment, the later the longer nothing has been written."""
+    chance = random.Random(1)
+    command = [sys.executable, "-c", WRITER.replace("{write}", write), str(folder), str(unnamed), str(overwrite)]
+    for number in range(12):
+        with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=ROOT) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"ready\n"
+            time.sleep(chance.uniform(0, 0.1) * (1 if any(folder.iterdir()) else 1.5**number))
+            process.kill()
+        output.sweep.cache_clear()
+        yield
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.slow
+def test_a_killed_writer_leaves_whole_files_only(overwrite: bool, unnamed: bool, tmp_path: Path) -> None:
+    seen = 0
+    for _ in kill_writers(WRITE_ONE, tmp_path, unnamed=unnamed, overwrite=overwrite):
+        parts = [name for name in names(tmp_path) if not name.startswith("out")]
+        if unnamed and not overwrite:
+            assert parts == []
+        for name in set(names(tmp_path)) - set(parts) - {"out-last"}:
+            data = (tmp_path / name).read_bytes()
+            assert data == data[:1] * 400_000
+            seen += 1
+        output.write_atomically(tmp_path / "out-last", [b"x"], overwrite=True)  # another run, which sweeps
+        assert [name for name in names(tmp_path) if not name.startswith("out")] == []
+        for path in tmp_path.glob("out-*"):
+            path.unlink()
+    assert seen  # not all were killed before they had written anything
 
 
 def test_a_killed_writer_never_leaves_two_sets_under_one_header(tmp_path: Path) -> None:
-    chance, whole = random.Random(2), 0
-    for number in range(12):
-        with subprocess.Popen([sys.executable, "-c", WRITER, tmp_path], stdout=subprocess.PIPE, cwd=ROOT) as process:
-            assert process.stdout is not None
-            assert process.stdout.readline() == b"ready\n"
-            time.sleep(chance.uniform(0, 0.1) * (1 if whole else 1.5**number))  # a busy machine may take longer
-            process.kill()
+    whole = 0
+    for _ in kill_writers(WRITE_SET, tmp_path):
         if (tmp_path / "a").exists():
             whole += 1
             assert len({(tmp_path / name).read_bytes() for name in ("a-0", "a-1", "a-2", "a")}) == 1
-        output.sweep.cache_clear()
         output.sweep(tmp_path)
-        assert {path.name for path in tmp_path.iterdir()} <= {"a-0", "a-1", "a-2", "a"}
+        assert set(names(tmp_path)) <= {"a-0", "a-1", "a-2", "a"}
     assert whole
