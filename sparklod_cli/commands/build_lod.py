@@ -5,40 +5,69 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.formats import FORMATS, MANIFEST, NPZ, RAW_SUFFIXES, TILESET, WRITABLE, ending_of
+from ..codecs.formats import FORMATS, MANIFEST, TILESET, WRITABLE
 from ..codecs.formats import RAD_SUFFIX as RAD
+from ..codecs.options import MAX_SH_CODES, SH_CODES, WriteOptions
+from ..fitting import FIT_DEVICE_HELP, SEED, SEED_HELP, STEPS
+from ..lod.tree_settings import (
+    DEFAULT_BASE,
+    DEFAULT_GROWTH,
+    DETAIL_GROWTH,
+    MAX_BASE,
+    MAX_GROWTH,
+    METHODS,
+    MIN_BASE,
+    MIN_GROWTH,
+    DetailSettings,
+    TileSettings,
+)
+from ..model import MAX_SH_DEGREE
+from ..render import DEVICES
 from ..system import interrupts
 from ..system.addresses import Address, Place
 from ..system.errors import SparklodError
+from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import format_size, percent_of
 from ..system.untrusted import MOST, shortened
-from .command import COMMON, Command, values_of
+from .command import COMMON, Command, OptionalNumber, flag, values_of
 from .console import Console, count_of, print_json, say
-from .options.baking import (
-    CLUSTER,
-    DETAIL,
+from .option_groups import (
+    EACH_AS_JSON,
     FILE_FORMAT,
-    LARGE,
-    MANIFESTS,
+    JSON,
+    OUTPUT,
+    OVERWRITE,
     POSITION,
-    REFINING,
     SELECTION,
-    TILED,
-    TREE,
-    TREES,
-    BuildLodOptions,
+    General,
+    SceneOptions,
+    bake_settings,
+    memory_size,
 )
-from .paths import NAMELESS, Folder, claim_stdout, is_same_place, keep_apart, require_suffix, with_chunks
+from .outputs import (
+    ARRAYS,
+    FORMS,
+    NAMELESS,
+    TREE_FORMS,
+    NamedPath,
+    Target,
+    claim_stdout,
+    is_same_place,
+    keep_apart,
+    shown,
+    stem_of,
+)
 from .rules import check, is_set
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import Outcome, Pair
+    from ..api.bake_jobs import BakeSettings, Outcome, Pair
     from ..bake.converting import Converted
     from ..bake.settings import Baked, Source
     from ..codecs.losses import Clamp, Losses
@@ -69,10 +98,224 @@ EXAMPLES = """\
   cat scene.ply | sparklod build-lod - -o - | aws s3 cp - s3://bucket/lod.spz
 """
 
-#: Suffixes of formats that hold no tree, and how else their names end.
+#: Endings of formats that hold no tree.
 PLAIN = {ending for form in FORMATS for ending in (*form.suffixes, *form.endings) if not form.trees}
 
+#: Endings of outputs of build-lod, and the formats.
+ENDINGS = [form.manifest or form.suffix for form in TREE_FORMS.values() if not form.chunked]
+TREES = [suffix for suffix, form in WRITABLE.items() if form.trees]
+
+#: Default builder of trees that detail levels or tiles are cut from.
+QUALITY = "quality"
+
+#: Value of --refine without a number, and an example of a useful number.
+BY_SIZE, EXAMPLE_STEPS = "default", 2000
+
+#: Values of --skip-existing: read only files whose size or date changed, or all.
+BY_DATE, VERIFY = "date", "verify"
+
+#: Headings of `--help`.
+TREE, REFINING, LARGE, CLUSTER = "Tree", "Refining", "Large scenes", "Cluster"
+DETAIL, TILED = DetailSettings.HEADING, TileSettings.HEADING
 HEADINGS = (COMMON, TREE, SELECTION, POSITION, FILE_FORMAT, "RAD", DETAIL, TILED, REFINING, LARGE, CLUSTER)
+
+
+@dataclass(frozen=True)
+class BuildLodOptions:
+    """Options of build-lod."""
+
+    inputs: tuple[Place, ...] = setting(
+        "", NamedPath(stdin=True, addresses=True), (), argument=True, nargs=-1, metavar="INPUT..."
+    )
+    merge: bool = flag(
+        "Bake all INPUTs as one scene, into the file that --output names: tiles of a city, each where its own"
+        " coordinates put it.",
+        heading=COMMON,
+    )
+    scene: Path | None = setting(
+        "Merge the files of an instances file, each where it stands there, in place of INPUTs (see docs/build-lod.md).",
+        NamedPath(),
+        heading=COMMON,
+    )
+    output: Place | None = setting(
+        "Output of a single input, or a folder for all outputs; - is standard output.  [default: NAME-lod.spz beside"
+        f" the input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format streamed-sog,"
+        f" NAME-lod/{TILESET} with --format 3d-tiles,"
+        " NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
+        NamedPath(output=True, addresses=True),
+        **OUTPUT,
+    )
+    output_dir: Place | None = setting(
+        "Folder for the outputs; created if it does not exist.",
+        NamedPath(output=True, folder=True, addresses=True),
+        heading=COMMON,
+    )
+    overwrite: bool = flag(**OVERWRITE)
+    skip_existing: str | None = setting(
+        "Skip inputs whose output exists already, made from the same inputs and settings, as a small file beside it,"
+        " NAME.sparklod.json, records. Files whose size and date are unchanged are not read;"
+        " --skip-existing=verify reads all, and so finds damage that left both as they were.",
+        (BY_DATE, VERIFY),
+        heading=LARGE,
+        metavar="[=verify]",
+        bare=BY_DATE,
+    )
+    form: str | None = setting(
+        "Format of the output. rad is what Spark streams; rad-chunked writes each chunk to a file of its own,"
+        " NAME-lod-0.radc and so on, beside NAME-lod.rad; streamed-sog is what PlayCanvas, SuperSplat and Babylon.js"
+        f" stream, {MANIFEST} and folders beside it; 3d-tiles is what CesiumJS streams, {TILESET} and a folder beside"
+        " it. A Level-of-Detail file of another format keeps its tree. "
+        " [default: by the name of FILE, or spz]",
+        tuple(TREE_FORMS),
+        flags=("--format",),
+        heading=COMMON,
+    )
+    refine: int | None = setting(
+        "Fit merged splats to pictures of full detail, in STEPS pictures of cuts: minutes, for cuts that come closer to"
+        " it. The leaves stay as they are, and so does the tree of a Level-of-Detail file. Ctrl-C ends it early and"
+        " keeps what was gained.  [default, without STEPS: by the size of the tree]",
+        OptionalNumber(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS, zero=BY_SIZE),
+        is_flag=False,
+        flag_value=BY_SIZE,
+        heading=REFINING,
+    )
+    camera_path: Path | None = setting(
+        "Cameras that --refine fits for, in the coordinates of the output, in any format that render reads: those of"
+        " visitors whose paths are known.  [default: cameras around and inside the scene]",
+        NamedPath(),
+        heading=REFINING,
+    )
+    seed: int = setting(SEED_HELP, SEED, 0, heading=REFINING)
+    device: str = setting(FIT_DEVICE_HELP, DEVICES, "cpu", heading=REFINING)
+    method: str | None = setting(
+        "How splats are merged: quick takes seconds; quality takes longer, and its cuts come closer to full detail."
+        f"  [default: {METHODS[0]}; quality with --format streamed-sog or 3d-tiles]",
+        METHODS,
+        heading=COMMON,
+    )
+    max_sh: int = setting(
+        "Highest degree of spherical harmonics to keep.", whole(0, MAX_SH_DEGREE), MAX_SH_DEGREE, heading=COMMON
+    )
+    base: float = setting(
+        "Growth of the voxel grid from level to level, with --method quick. Smaller values give smoother transitions"
+        " and more nodes.",
+        Range(MIN_BASE, MAX_BASE, unit="N"),
+        DEFAULT_BASE,
+        heading=TREE,
+    )
+    growth: float | None = setting(
+        "Largest number of nodes for each leaf, with --method quality."
+        f"  [default: {DEFAULT_GROWTH:g}; {DETAIL_GROWTH:g} with --format streamed-sog or"
+        f" 3d-tiles]",
+        Range(MIN_GROWTH, MAX_GROWTH, unit="N"),
+        heading=TREE,
+    )
+    input_scene: SceneOptions = field(default_factory=SceneOptions)
+    written: WriteOptions = field(default_factory=WriteOptions)
+    cluster_sh: int | None = setting(
+        "Write spherical harmonics to RAD as a palette of at most N entries, 2 to 65,536, and a label for each splat:"
+        " the file gets smaller, and reflections less exact. N is 65,536 if it is left out. SOG always has a palette;"
+        " this chooses its size, which otherwise suits the number of splats.",
+        OptionalNumber(SH_CODES, example=MAX_SH_CODES),
+        is_flag=False,
+        flag_value=str(MAX_SH_CODES),
+        heading=FILE_FORMAT,
+    )
+    detail: DetailSettings = field(default_factory=DetailSettings)
+    environment: Path | None = setting(
+        "Splats that are always drawn, such as a sky, from a file of any format without a tree; turned and moved as the"
+        " scene.",
+        NamedPath(),
+        heading=DETAIL,
+    )
+    environment_beyond: float | None = setting(
+        "Make splats whose centre is farther than this from the median of all centres the environment, in the input's"
+        " units.",
+        Range(above=0, unit="RADIUS"),
+        heading=DETAIL,
+    )
+    tiles: TileSettings = field(default_factory=TileSettings)
+    memory: int | None = setting(
+        "Memory that a bake may take, such as 4G or '600 MB'. A scene that needs more is baked out of core: block by"
+        " block, with a scratch folder.  [default: 75 % of what is available]",
+        Quantity("SIZE", memory_size),
+        heading=LARGE,
+    )
+    scratch_dir: Place | None = setting(
+        "Where a bake out of core makes its scratch folder, which is removed at the end.  [default: beside the output]",
+        NamedPath(output=True, folder=True, addresses=True),
+        heading=LARGE,
+    )
+    resume: bool = flag(
+        "Go on with a bake out of core that was interrupted; it must be the same bake. Without one, begin.",
+        heading=LARGE,
+    )
+    workers: int | None = setting(
+        "Bake on this many processes of this machine, which share --threads and --memory.",
+        whole(1, 256),
+        heading=CLUSTER,
+    )
+    scheduler: str | None = setting(
+        "Bake on the Dask cluster whose scheduler has this address, as tcp://host:8786.",
+        metavar="ADDRESS",
+        heading=CLUSTER,
+    )
+    as_json: bool = flag(EACH_AS_JSON, **JSON)
+    general: General = field(default_factory=General)
+
+    @property
+    def target(self) -> Target:
+        """What the names and --format say about the outputs; a refined RAD file stays one."""
+        target = Target.of(self.output, self.form, self.output_dir)
+        if self.refine is None or self.form is not None or target.kind == "file":
+            return target
+        are_rad = {source.suffix.lower() for source in self.inputs} == {RAD}
+        return dataclasses.replace(target, form=FORMS["rad"]) if are_rad else target
+
+    def output_of(self, source: Place, target: Target) -> Place:
+        """Return the output for an input."""
+        if target.file is not None:
+            return target.file
+        form, stem = target.form, stem_of(source)
+        is_chosen = self.form is not None or self.refine is not None
+        if form.manifest or (is_chosen and source.suffix.lower() in TREES):
+            stem = stem.removesuffix("-lod")  # a tree in another format has its name
+        name = f"{stem}-lod/{form.manifest}" if form.manifest else f"{stem}-lod{form.suffix}"
+        if self.refine is not None and name == source.name:
+            name = f"{stem}-lod-refined{form.suffix}"
+        return (target.folder or source.parent) / name
+
+    def builder(self, target: Target) -> str:
+        """Return the builder of the tree, by --method, or else by the format."""
+        return self.method or (QUALITY if target.form.manifest else METHODS[0])
+
+    def settings(self, ctx: click.Context, target: Target) -> BakeSettings:
+        """Return the settings of bakes; loads numpy."""
+        refine = None
+        if self.refine is not None:
+            from ..fitting.settings import FitSettings
+
+            refine = FitSettings(self.refine or None, self.seed, device=self.device)
+        form = target.form
+        names_tree = target.file is not None and target.file != DASH and form.suffix in TREES
+        return bake_settings(
+            ctx,
+            form,
+            self.input_scene,
+            self.written,
+            self.cluster_sh,
+            method=self.builder(target),
+            base=self.base,
+            growth=self.growth or (DETAIL_GROWTH if form.manifest else DEFAULT_GROWTH),
+            max_sh=self.max_sh,
+            detail=self.detail if form.name == DETAIL else None,
+            tiles=self.tiles if form.name == TILED else None,
+            environment=self.environment,
+            environment_beyond=self.environment_beyond,
+            refine=refine,
+            camera_path=self.camera_path,
+            converts=self.form is not None or names_tree or bool(form.manifest),
+        )
 
 
 #: Options of earlier versions, and what to write instead.
@@ -103,26 +346,20 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     An input that fails does not stop the others; the exit status is 1 if any did. With --workers or --scheduler,
     several inputs are baked side by side (extra cluster).
     """
-    output = ctx.params["output"]
-    if isinstance(output, Folder):  # an --output that names a folder is an --output-dir
-        ctx.params.update(output=None, output_dir=output.path)
     options = values_of(ctx, BuildLodOptions)
-    general = options.general
-    instances = _check(ctx, options)
+    general, target = options.general, options.target
+    instances = _check(ctx, options, target)
     failed, console = False, Console(quiet=general.quiet, verbose=general.verbose)
     with console, contextlib.ExitStack() as stack:
-        if options.output is not None and (options.merge or options.scene is not None):
-            from ..api.bake_jobs import merged_source
+        from ..api.bake_jobs import bake_files, merged_source
 
+        pairs: Sequence[Pair] = [(source, options.output_of(source, target)) for source in options.inputs]
+        if target.file is not None and (options.merge or options.scene is not None):
+            pairs = [(merged_source(options.inputs, instances), target.file)]
             if any(each.lod_scale != 1 or each.foveation is not None for each in instances):
                 viewers = "lod_scale and foveation of instances are for viewers, and no part of a tree"
                 console.say(f"{options.scene}: {viewers}")
-            pairs: Sequence[Pair] = [(merged_source(options.inputs, instances), options.output)]
-        else:
-            pairs = [(source, options.target(source)) for source in options.inputs]
-        from ..api.bake_jobs import bake_files
-
-        settings = options.bake_settings(ctx)
+        settings = options.settings(ctx, target)
         console.announce_compiling(settings)
         outcomes = bake_files(
             pairs,
@@ -141,103 +378,80 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
             cluster_threads=general.threads if options.scheduler is None or is_set(ctx, "threads") else None,
         )
         stack.enter_context(contextlib.closing(outcomes))
-        for (source, target), outcome in zip(pairs, outcomes, strict=True):
+        for (source, output), outcome in zip(pairs, outcomes, strict=True):
             if isinstance(outcome, SparklodError):
                 failed = True
                 console.error(f"{name_of(source)}: {outcome}")
             elif outcome is None:
-                console.say(f"{name_of(source)}  ->  {target}  exists already")
+                console.say(f"{name_of(source)}  ->  {output}  exists already")
             else:
-                report_baked(console, source, "standard output" if target == DASH else str(target), outcome)
+                report_baked(console, source, shown(output), outcome)
             if options.as_json:
-                print_json(record_of(source, target, outcome))
-            if interrupts.came.is_set():  # during fitting, which then ends early
-                console.clear()
-                say("interrupted")
-                ctx.exit(interrupts.INTERRUPTED)
+                print_json(record_of(source, output, outcome))
+            exit_if_interrupted(ctx, console)
     if failed:
         ctx.exit(1)
 
 
-def _check(ctx: click.Context, options: BuildLodOptions) -> list[Instance]:
+def exit_if_interrupted(ctx: click.Context, console: Console) -> None:
+    """Exit after Ctrl-C during fitting, which then ends early and writes its output."""
+    if interrupts.came.is_set():
+        console.clear()
+        say("interrupted")
+        ctx.exit(interrupts.INTERRUPTED)
+
+
+def _check(ctx: click.Context, options: BuildLodOptions, target: Target) -> list[Instance]:
     """Return the instances of --scene; raise a `click.UsageError` where options or names of files contradict."""
-    if not options.inputs and options.scene is None:
+    inputs, merges = options.inputs, options.merge or options.scene is not None
+    if not inputs and options.scene is None:
         raise click.MissingParameter(ctx=ctx, param=next(each for each in ctx.command.params if each.name == "inputs"))
-    inputs, output, form = options.inputs, options.output, options.output_form
-    merges = options.merge or options.scene is not None
-    place = "standard output" if output == DASH else "file" if output is not None else "folder"
-    check(ctx, place=place, source="standard input" if DASH in inputs else "files", count=len(inputs))
+    source = "standard input" if DASH in inputs else "files"
+    check(ctx, place=target.kind, source=source, count=len(inputs))
     instances: list[Instance] = []
     if options.scene is not None:
         from ..viewers.instances_file import read_instances
 
         instances = read_instances(options.scene)
-    if output is not None:
-        if len(inputs) > 1 and not options.merge:
-            raise click.UsageError(
-                f"--output takes one input, not {len(inputs)}; add --merge to bake them as one scene, or name a folder"
-            )
-    elif DASH in inputs:
+    if target.file is not None and len(inputs) > 1 and not options.merge:
+        raise click.UsageError(
+            f"--output takes one input, not {len(inputs)}; add --merge to bake them as one scene, or name a folder"
+        )
+    if target.file is None and DASH in inputs:
         raise click.UsageError(NAMELESS)
-    elif options.output_dir is None:
-        for source in inputs:
-            if isinstance(source, Address) and source.is_read_only:
-                raise click.UsageError(
-                    f"nothing can be written beside {source}; name the output with -o or --output-dir"
-                )
-    targets = [output] if output is not None else [options.target(source) for source in inputs]
-    refines = options.refine is not None and not options.skip_existing and not merges
-    if refines and options.overwrite:  # a tree may replace itself, for its leaves and links stay
-        targets = [target for source, target in zip(inputs, targets, strict=True) if not is_same_place(source, target)]
-    unbundled = form.suffix in WRITABLE and form.suffix == WRITABLE[form.suffix].unbundled
-    if form.chunked or unbundled or form.cuts:
-        targets = with_chunks(targets)
+    if target.file is None and target.folder is None:
+        for each in inputs:
+            if isinstance(each, Address) and each.is_read_only:
+                raise click.UsageError(f"nothing can be written beside {each}; name the output with -o or --output-dir")
+    outputs = [options.output_of(each, target) for each in inputs] if target.file is None else [target.file]
+    if options.refine is not None and options.overwrite and not options.skip_existing and not merges:
+        # A tree may replace itself, for its leaves and links stay.
+        outputs = [output for each, output in zip(inputs, outputs, strict=True) if not is_same_place(each, output)]
     named = [instance.file for instance in instances if instance.file is not None]
-    keep_apart(ctx, {"output" if options.output_dir is None else "output_dir": targets, "scene": named})
+    keep_apart(ctx, {"output": target.files(outputs), "scene": named})
     claim_stdout(ctx, "output", as_json=options.as_json, binary=True)
-    check_formats(options)
-    check(ctx, format=options.format, method=options.builder)
+    _check_format(options, target)
+    check(ctx, format=target.form.name, method=options.builder(target))
     return instances
 
 
-def check_formats(options: BuildLodOptions) -> None:
-    """Raise a `click.UsageError` where the options of formats, and the name of the output, contradict each other."""
-    form, suffix, output = options.output_form, ending_of(options.name), options.output
-    chosen = options.form is not None or output is not None
+def _check_format(options: BuildLodOptions, target: Target) -> None:
+    """Raise a `click.UsageError` where the format is not clear, or holds no tree."""
     suffixes = {source.suffix.lower() for source in options.inputs}
-    if options.refine is not None and not chosen and RAD in suffixes and len(suffixes) > 1:
+    if options.refine is not None and options.form is None and options.output is None and RAD in suffixes != {RAD}:
         raise click.UsageError(
             "--refine keeps the format of a Level-of-Detail file, and the inputs are of several; give --format, or"
             " refine the .rad files on their own"
         )
-    if form.cuts:
-        _check_cuts(options)
-        return
-    if form.chunked and output == DASH:
-        raise click.UsageError("--format rad-chunked writes several files; name the output, or use --format rad")
-    if options.form is not None and suffix not in ("", form.suffix):
-        raise click.UsageError(f"--format {options.form} writes {form.suffix}, not {suffix}")
-    if output is not None and options.form is None:
-        require_suffix("--output", output, (*TREES, MANIFEST, TILESET))
-    known = f"{', '.join((*TREES, MANIFEST))} or {TILESET}"
-    if suffix in (NPZ, *RAW_SUFFIXES):
-        raise click.UsageError(f"{suffix} holds arrays; bake a tree, and write it with sparklod convert --layout")
-    if suffix in PLAIN:
-        raise click.UsageError(f"{suffix} cannot hold a tree; name the output {known}, or write sparklod convert")
-    if suffix not in ("", *TREES):
-        names = f"{', '.join((*TREES.values(), DETAIL))} or {TILED}"
-        raise click.UsageError(f"trees are written as {names}, not as {suffix}; name the output {known}")
-
-
-def _check_cuts(options: BuildLodOptions) -> None:
-    form, output = options.output_form, options.output
-    flag = f"--format {MANIFESTS[form.manifest]}"
-    if output == DASH:
-        raise click.UsageError(f"{flag} writes several files; name the output, such as web/{form.manifest}")
-    if output is not None and options.name != form.manifest:
+    target.check_name("--output", ENDINGS)
+    form, known = target.form, f"{', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
+    if form.suffix in ARRAYS:
+        raise click.UsageError(f"{form.suffix} holds arrays; bake a tree, and write it with sparklod convert --layout")
+    if form.suffix in PLAIN and not form.manifest:
+        raise click.UsageError(f"{form.suffix} cannot hold a tree; name the output {known}, or write sparklod convert")
+    if form not in TREE_FORMS.values():
         raise click.UsageError(
-            f"{flag} writes {form.manifest} and {form.beside} beside it, not {output.name}; name the output"
-            f" {output.parent / output.stem / form.manifest}"
+            f"trees are written as SPZ, RAD, {DETAIL} or {TILED}, not as {form.suffix}; name the output {known}"
         )
 
 

@@ -202,13 +202,21 @@ def _print_help_all(ctx: click.Context, param: click.Parameter, value: bool) -> 
 
 
 def refuse_output_among_inputs(ctx: click.Context, *, missing: bool = False) -> None:
-    """Raise a `click.UsageError` if the last input seems to be the output, as with cp: it does not exist."""
+    """Raise a `click.UsageError` if the last input seems to be the output, as with cp.
+
+    It does not exist; or it is a file of a format of trees, second after a file of another format.
+    """
     *others, last = ctx.params.get("inputs") or ctx.params.get("files") or (None,)
-    if not others or not isinstance(last, Path) or last.exists():
+    if not others or not isinstance(last, Path):
         return
+    error = "{} does not exist; did you mean {} {}?"
+    if last.exists():
+        is_tree = last.suffix.lower() in TREES and len(others) == 1 and others[0].suffix.lower() not in TREES
+        if ctx.command.name != "build-lod" or not is_tree:
+            return
+        error = "{} exists, and is taken for an input; did you mean {} {}?"
     import shlex  # needed after a mistake only
 
-    error = "{} does not exist; did you mean {} {}?"
     for name, suffixes in OTHER_OUTPUTS.items():
         if name in ctx.params and not ctx.params[name] and last.suffix.lower() in suffixes:
             raise click.UsageError(error.format(last, f"--{name}", shlex.quote(str(last))), ctx)

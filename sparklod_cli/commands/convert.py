@@ -3,44 +3,43 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from ..codecs.formats import ENCODINGS, MANIFEST, NPZ, RAW_SUFFIXES, TILESET, WRITABLE, ending_of
+from ..codecs.formats import ENCODINGS, WRITABLE
 from ..codecs.options import WriteOptions
 from ..system.addresses import Place
 from ..system.errors import FormatError, InvalidSplatsError, OutOfMemoryError, naming
 from ..system.setting_fields import setting, setting_of
 from ..system.stdio import DASH, name_of
-from .build_lod import record_of, report_baked, report_converted
+from .build_lod import BuildLodOptions, record_of, report_baked, report_converted
 from .command import COMMON, Command, flag, values_of
 from .console import Console, print_json
-from .options.baking import (
+from .option_groups import (
+    EACH_AS_JSON,
     FILE_FORMAT,
-    FORMS,
+    JSON,
+    OVERWRITE,
     POSITION,
     SELECTION,
-    BuildLodOptions,
-    OutputForm,
+    General,
     SceneOptions,
-    write_options,
+    bake_settings,
 )
-from .options.common import EACH_AS_JSON, JSON, OVERWRITE, General
-from .paths import (
-    NAMELESS,
+from .outputs import (
+    ARRAYS,
+    FORMS,
+    PLAIN_FORMS,
     Folder,
     NamedPath,
+    Target,
     claim_stdout,
     keep_apart,
-    require_suffix,
-    stem_of,
-    with_chunks,
+    name_outputs,
+    shown,
 )
 from .rules import check
-
-if TYPE_CHECKING:
-    from ..bake.settings import BakeSettings
 
 EXAMPLES = """\
   sparklod convert scene.ply scene.sog              # for PlayCanvas
@@ -56,17 +55,8 @@ EXAMPLES = """\
   curl -s https://example.com/a.ply | sparklod convert - - --format spz > a.spz
 """
 
-#: Values of --format: those of trees, plain formats by their first suffix, and arrays.
-TREE_FORMS = ("spz", "rad", "rad-chunked")
-NAMES = {
-    **{name: FORMS[name] for name in TREE_FORMS},
-    **{
-        suffix[1:]: OutputForm(suffix)
-        for suffix, form in WRITABLE.items()
-        if suffix.startswith(".") and suffix[1:] not in FORMS
-    },
-    **{suffix[1:]: OutputForm(suffix) for suffix in (NPZ, *RAW_SUFFIXES)},
-}
+#: Values of --format.
+NAMES = ("spz", "rad", "rad-chunked", *PLAIN_FORMS)
 
 
 @dataclass(frozen=True)
@@ -77,7 +67,7 @@ class ConvertOptions:
     output: Place = setting("", NamedPath(output=True, addresses=True), argument=True, metavar="OUT", required=True)
     form: str | None = setting(
         "Format of OUT; rad-chunked writes each chunk of a RAD to a file of its own.  [default: by the name of OUT]",
-        tuple(NAMES),
+        NAMES,
         flags=("--format",),
         heading=COMMON,
     )
@@ -86,7 +76,7 @@ class ConvertOptions:
         heading=COMMON,
     )
     layout: str | None = setting(
-        f"Layout of the arrays in a viewer's memory that {NPZ} has, or without names {' and '.join(RAW_SUFFIXES)}.",
+        f"Layout of the arrays in a viewer's memory that {ARRAYS[0]} has, or without names {' and '.join(ARRAYS[1:])}.",
         ENCODINGS,
         heading=COMMON,
     )
@@ -97,25 +87,6 @@ class ConvertOptions:
     cluster_sh: int | None = setting_of(BuildLodOptions, "cluster_sh")
     as_json: bool = flag(EACH_AS_JSON, **JSON)
     general: General = field(default_factory=General)
-
-    @property
-    def output_form(self) -> OutputForm:
-        """Format of the output, by --format, or else by the name of the output."""
-        return OutputForm(ending_of(self.output.name)) if self.form is None else NAMES[self.form]
-
-    def settings(self, ctx: click.Context) -> BakeSettings:
-        """Return the settings of the conversion; loads numpy."""
-        from ..bake.settings import BakeSettings
-
-        form = self.output_form
-        return BakeSettings(
-            max_sh=self.max_sh,
-            **self.scene.settings(ctx),
-            suffix=form.suffix,
-            options=write_options(self.written, self.cluster_sh, chunked=form.chunked),
-            converts=True,
-            recodes=True,
-        )
 
 
 HEADINGS = (COMMON, SELECTION, POSITION, FILE_FORMAT, "RAD")
@@ -133,23 +104,32 @@ def convert(ctx: click.Context, /, **_: Any) -> None:
 
     --layout writes arrays as viewers have them in memory.
     """
-    output = ctx.params["output"]
-    if isinstance(output, Folder):
-        ctx.params["output"] = output.path / _name_in_folder(ctx)
+    form = ctx.params["form"]
+    if isinstance(ctx.params["output"], Folder) and form is None:
+        raise click.UsageError(f"OUT is a folder; name the file in it, or add --format, such as {', '.join(NAMES[:3])}")
+    name_outputs(ctx, ctx.params["source"], FORMS[form].suffix if form else "")
     options = values_of(ctx, ConvertOptions)
-    general, source, target = options.general, options.source, options.output
-    _check(ctx, options)
+    general, source, output, target = options.general, options.source, options.output, Target.of(options.output, form)
+    _check(ctx, options, target)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..bake.converting import Converted
         from ..bake.converting import convert as convert_file
 
-        settings = options.settings(ctx)
         console.announce_compiling()
         with naming(name_of(source), (FormatError, InvalidSplatsError, OutOfMemoryError)):
             made = convert_file(
                 source,
-                target,
-                settings,
+                output,
+                bake_settings(
+                    ctx,
+                    target.form,
+                    options.scene,
+                    options.written,
+                    options.cluster_sh,
+                    max_sh=options.max_sh,
+                    converts=True,
+                    recodes=True,
+                ),
                 layout=options.layout,
                 leaves=options.leaves,
                 overwrite=options.overwrite,
@@ -157,45 +137,26 @@ def convert(ctx: click.Context, /, **_: Any) -> None:
                 progress=console.progress,
                 say=console.say,
             )
-        named = "standard output" if target == DASH else str(target)
         if isinstance(made, Converted):
-            report_converted(console, source, named, made)
+            report_converted(console, source, shown(output), made)
         else:
-            report_baked(console, source, named, made)
+            report_baked(console, source, shown(output), made)
         if options.as_json:
-            print_json(record_of(source, target, made))
+            print_json(record_of(source, output, made))
 
 
-def _name_in_folder(ctx: click.Context) -> str:
-    source, form = ctx.params["source"], ctx.params["form"]
-    if source == DASH:
-        raise click.UsageError(NAMELESS)
-    if form is None:
-        raise click.UsageError(
-            f"OUT is a folder; name the file in it, or add --format, such as {', '.join(TREE_FORMS)}"
-        )
-    return f"{stem_of(source)}{NAMES[form].suffix}"
-
-
-def _check(ctx: click.Context, options: ConvertOptions) -> None:
+def _check(ctx: click.Context, options: ConvertOptions, target: Target) -> None:
     """Raise a `click.UsageError` where options contradict each other, or the name of the output."""
-    output, form = options.output, options.output_form
-    known, arrays = tuple(WRITABLE), (NPZ, *RAW_SUFFIXES)
-    if options.form is None:
-        if output == DASH:
-            raise click.UsageError("standard output has no name, which chooses the format; add --format")
-        require_suffix("OUT", output, known)
-        if output.name in (MANIFEST, TILESET):
-            raise click.UsageError(f"{output.name} consists of cuts of a tree; build-lod -o {output} makes them")
-        if form.suffix not in (*known, *arrays):
-            raise click.UsageError(f"OUT ends in {', '.join((*known, *arrays))}, not {form.suffix}")
-    elif ending_of(output.name) not in ("", form.suffix):
-        raise click.UsageError(f"--format {options.form} writes {form.suffix}, not {ending_of(output.name)}")
-    if form.chunked and output == DASH:
-        raise click.UsageError("--format rad-chunked writes several files; name the output, or use --format rad")
-    if form.suffix in arrays and options.layout is None:
+    form, output, endings = target.form, options.output, (*WRITABLE, *ARRAYS)
+    if options.form is None and output == DASH:
+        raise click.UsageError("standard output has no name, which chooses the format; add --format")
+    target.check_name("OUT", WRITABLE)
+    if form.manifest:
+        raise click.UsageError(f"{form.manifest} consists of cuts of a tree; build-lod -o {output} makes them")
+    if form.suffix not in endings:
+        raise click.UsageError(f"OUT ends in {', '.join(endings)}, not {form.suffix}")
+    if form.suffix in ARRAYS and options.layout is None:
         raise click.UsageError(f"{form.suffix} holds arrays; choose their --layout: {', '.join(ENCODINGS)}")
-    check(ctx, format="--layout" if form.suffix in arrays else WRITABLE[form.suffix].name, suffix=form.suffix)
-    unbundled = form.suffix in WRITABLE and form.suffix == WRITABLE[form.suffix].unbundled
-    keep_apart(ctx, {"output": with_chunks([output]) if form.chunked or unbundled else [output]})
+    check(ctx, format=form.name, suffix=form.suffix)
+    keep_apart(ctx, {"output": target.files([output])})
     claim_stdout(ctx, "output", as_json=options.as_json, binary=True)

@@ -30,7 +30,7 @@ from ..system.threads import processors
 from ..system.untrusted import printable
 from .command import Command, flag, values_of
 from .console import Console, count_of, print_json
-from .options.common import JSON, QUIET, VERBOSE
+from .option_groups import JSON, QUIET, VERBOSE
 
 #: Beginning of the names of checks of extras.
 EXTRA = "extra "

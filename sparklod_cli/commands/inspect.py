@@ -24,8 +24,8 @@ from ..system.units import format_size
 from ..system.untrusted import MOST, printable, shortened
 from .command import COMMON, Command, flag, values_of
 from .console import Console, count_of, rows
-from .options.common import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, assert_errors, table_output
-from .paths import NamedPath, keep_apart, name_outputs
+from .option_groups import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, assert_errors, table_output
+from .outputs import NamedPath, keep_apart, name_outputs
 from .rules import check
 
 if TYPE_CHECKING:

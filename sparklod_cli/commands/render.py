@@ -22,20 +22,28 @@ from ..system.units import format_size, parse_time
 from ..viewers.viewer_settings import BLEND, StreamingSettings
 from .command import COLOR, COMMON, VIEW, Command, flag, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
-from .options.common import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
-from .options.viewing import (
+from .option_groups import (
     AROUND_SCENE,
+    ASSERT,
     CAMERAS,
+    JSON,
     MOST_DRAWN,
+    OUTPUT,
+    OVERWRITE,
+    PNG,
     Cameras,
     CutOptions,
+    General,
     Inputs,
+    assert_errors,
     check_view,
     files_read,
+    report_outcomes,
     scenes_of,
+    table_output,
     with_planes,
 )
-from .paths import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
+from .outputs import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
 from .rules import check, is_set
 
 if TYPE_CHECKING:

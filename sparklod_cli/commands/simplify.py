@@ -9,36 +9,41 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..codecs.formats import WRITABLE, ending_of
+from ..codecs.formats import WRITABLE
 from ..codecs.options import WriteOptions
 from ..fitting import STEPS
 from ..fitting.settings import FitSettings
 from ..lod.budget import Budget, doubt, parse_budget
 from ..lod.tree_settings import DETAIL_GROWTH
-from ..system import interrupts
 from ..system.addresses import Place
 from ..system.errors import FormatError, SparklodError, naming
 from ..system.setting_fields import Quantity, Range, setting, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
-from .build_lod import record_of, report_baked
-from .command import COMMON, Command, OptionalNumber, flag, values_of
-from .console import Console, print_json, say
-from .options.baking import (
+from .build_lod import (
     BY_SIZE,
     EXAMPLE_STEPS,
+    QUALITY,
+    BuildLodOptions,
+    exit_if_interrupted,
+    record_of,
+    report_baked,
+)
+from .command import COMMON, Command, OptionalNumber, flag, values_of
+from .console import Console, print_json
+from .option_groups import (
+    EACH_AS_JSON,
     FILE_FORMAT,
-    METHOD_OF_DETAIL,
+    JSON,
+    OVERWRITE,
     POSITION,
     SELECTION,
-    SPZ,
-    BuildLodOptions,
+    General,
     SceneOptions,
+    bake_settings,
     memory_size,
-    write_options,
 )
-from .options.common import EACH_AS_JSON, JSON, OVERWRITE, General
-from .paths import NAMELESS, Folder, NamedPath, claim_stdout, keep_apart, require_suffix, stem_of, with_chunks
+from .outputs import NamedPath, Target, claim_stdout, keep_apart, name_outputs, shown
 from .rules import GOALS, check, flags_set
 
 if TYPE_CHECKING:
@@ -118,23 +123,19 @@ class SimplifyOptions:
     as_json: bool = flag(EACH_AS_JSON, **JSON)
     general: General = field(default_factory=General)
 
-    @property
-    def suffix(self) -> str:
-        """Ending of the output's name, see `WRITABLE`."""
-        return SPZ if self.output == DASH else ending_of(self.output.name)
-
-    def settings(self, ctx: click.Context) -> BakeSettings:
+    def settings(self, ctx: click.Context, target: Target) -> BakeSettings:
         """Return the settings of the bake whose tree is cut; loads numpy."""
-        from ..api.bake_jobs import BakeSettings
         from ..bake.simplifying import SimplifyGoal
 
-        return BakeSettings(
-            method=METHOD_OF_DETAIL,
+        return bake_settings(
+            ctx,
+            target.form,
+            self.scene,
+            self.written,
+            self.cluster_sh,
+            method=QUALITY,
             growth=DETAIL_GROWTH,
             max_sh=self.max_sh,
-            **self.scene.settings(ctx),
-            suffix=self.suffix,
-            options=write_options(self.written, self.cluster_sh),
             simplify=SimplifyGoal(self.to, self.max_bytes, self.psnr),
             refine=None if self.refine is None else FitSettings(self.refine or None, self.seed, device=self.device),
             camera_path=self.camera_path,
@@ -154,24 +155,20 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     a file that every viewer of plain splats shows. Several INPUTs become one scene, each where its own coordinates put
     it; an INPUT of - is standard input. A Level-of-Detail file is cut as it is.
     """
-    output = ctx.params["output"]
-    if isinstance(output, Folder):
-        if ctx.params["inputs"][0] == DASH:
-            raise click.UsageError(f"--output {output.path}: {NAMELESS}")
-        ctx.params["output"] = output.path / f"{stem_of(ctx.params['inputs'][0])}-small{SPZ}"
+    name_outputs(ctx, ctx.params["inputs"][0], "-small.spz")
     options = values_of(ctx, SimplifyOptions)
-    general, inputs = options.general, options.inputs
-    _check(ctx, options)
+    general, inputs, output, target = options.general, options.inputs, options.output, Target.of(options.output)
+    _check(ctx, options, target)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.bake_jobs import Baked, bake_files, merged_source
 
-        settings = options.settings(ctx)
+        settings = options.settings(ctx, target)
         if options.to is not None and (question := doubt(options.to.count)):
             console.say(question)
         console.announce_compiling(settings)
         source = inputs[0] if len(inputs) == 1 else merged_source(inputs)
         (baked,) = bake_files(
-            [(source, options.output)],
+            [(source, output)],
             settings,
             overwrite=options.overwrite,
             threads=general.threads,
@@ -185,25 +182,21 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
             with naming(name_of(source), FormatError) if len(inputs) == 1 else contextlib.nullcontext():
                 raise baked
         assert isinstance(baked, Baked)
-        report_baked(console, source, "standard output" if options.output == DASH else str(options.output), baked)
+        report_baked(console, source, shown(output), baked)
         if options.as_json:
-            print_json(record_of(source, options.output, baked))
-        if interrupts.came.is_set():  # during fitting, which then ends early
-            console.clear()
-            say("interrupted")
-            ctx.exit(interrupts.INTERRUPTED)
+            print_json(record_of(source, output, baked))
+        exit_if_interrupted(ctx, console)
 
 
-def _check(ctx: click.Context, options: SimplifyOptions) -> None:
+def _check(ctx: click.Context, options: SimplifyOptions, target: Target) -> None:
     """Raise a `click.UsageError` where options contradict each other, or the names of options."""
     if not flags_set(ctx, GOALS):
         raise click.UsageError("say how many splats to keep: give one of --to, --max-bytes and --psnr")
-    require_suffix("--output", options.output, WRITABLE)
-    if options.suffix not in WRITABLE:
-        raise click.UsageError(f"--output writes {', '.join(WRITABLE)}, not {options.suffix}")
-    form = WRITABLE[options.suffix]
-    keep_apart(ctx, {"output": with_chunks([options.output]) if form.unbundled == options.suffix else [options.output]})
-    claim_stdout(ctx, "output", as_json=options.as_json, binary=True)
+    target.check_name("--output", WRITABLE)
+    if target.form.suffix not in WRITABLE:
+        raise click.UsageError(f"--output writes {', '.join(WRITABLE)}, not {target.form.suffix}")
     if DASH in options.inputs and len(options.inputs) > 1:
         raise click.UsageError("standard input cannot be merged with files; save it to a file first")
-    check(ctx, count=len(options.inputs), format=form.name)
+    check(ctx, count=len(options.inputs), format=target.form.name)
+    keep_apart(ctx, {"output": target.files([options.output])})
+    claim_stdout(ctx, "output", as_json=options.as_json, binary=True)

@@ -20,9 +20,24 @@ from ..tables.columns import FORMS
 from ..viewers.viewer_settings import StreamingSettings
 from .command import COMMON, Command, flag, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
-from .options.common import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
-from .options.viewing import Cameras, CutOptions, Inputs, check_view, files_read, scenes_of
-from .paths import NamedPath, claim_stdout, keep_apart, name_outputs
+from .option_groups import (
+    ASSERT,
+    JSON,
+    OUTPUT,
+    OVERWRITE,
+    PNG,
+    Cameras,
+    CutOptions,
+    General,
+    Inputs,
+    assert_errors,
+    check_view,
+    files_read,
+    report_outcomes,
+    scenes_of,
+    table_output,
+)
+from .outputs import NamedPath, claim_stdout, keep_apart, name_outputs
 from .rules import check
 
 if TYPE_CHECKING:

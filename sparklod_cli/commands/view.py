@@ -18,8 +18,8 @@ from ..system.units import format_size, parse_count
 from ..system.untrusted import printable
 from .command import COMMON, DIRECTION, VIEW, Command, flag, values_of
 from .console import Console, count_of, print_json
-from .options.common import DEFAULT_UP, JSON, OVERWRITE, QUIET, UP, VERBOSE, General
-from .paths import NamedPath, keep_apart
+from .option_groups import DEFAULT_UP, JSON, OVERWRITE, QUIET, UP, VERBOSE, General
+from .outputs import NamedPath, keep_apart
 
 if TYPE_CHECKING:
     from ..api.viewing import Server, Site

@@ -11,7 +11,7 @@ import click
 from ..system.setting_fields import setting, whole
 from .command import Command, flag, values_of
 from .console import Console, count_of, print_json
-from .options.common import JSON, QUIET, VERBOSE, processors_to_use
+from .option_groups import JSON, QUIET, VERBOSE, processors_to_use
 
 EXAMPLES = """\
   sparklod warmup                                # once, after pip install

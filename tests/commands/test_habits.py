@@ -48,6 +48,14 @@ def test_an_output_named_as_of_cp_is_recognised(line: str, output: str, capsys: 
     assert refused(line, capsys) == f"error: {output} does not exist; did you mean -o {output}?"
 
 
+def test_an_output_that_exists_is_recognised(capsys: Capture) -> None:
+    said = "out.spz exists, and is taken for an input; did you mean -o out.spz?"
+    for source in (FIXTURES / "sh0.ply", FIXTURES / "golden" / "tree-v3.spz"):
+        shutil.copy(source, "out.spz")
+        assert refused("build-lod scene.ply out.spz", capsys) == f"error: {said}"
+        assert refused("build-lod scene.ply out.spz --method quality", capsys) == f"error: {said}"
+
+
 @pytest.mark.parametrize(
     ("line", "flag", "output"),
     [

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import COMMANDS, cli, run
-from sparklod_cli.commands.paths import NamedPath
+from sparklod_cli.commands.outputs import NamedPath
 from tests.conftest import FIXTURES, Capture
 
 PLAIN, LOD = FIXTURES / "one.ply", FIXTURES / "golden" / "tree-v3.spz"
@@ -180,7 +180,7 @@ def test_a_folder_is_not_filled_with_inputs_replaced(tmp_path: Path, capsys: Cap
     for file in (plain, other):
         file.write_bytes(PLAIN.read_bytes())
     for options in ([], ["--output-dir", str(tmp_path)]):
-        assert run(["build-lod", str(plain), str(other), *options, "--overwrite"]) == 2
+        assert run(["build-lod", str(other), str(plain), *options, "--overwrite"]) == 2
         assert f"{other} is an input" in capsys.readouterr().err
     assert other.read_bytes() == PLAIN.read_bytes()
 
