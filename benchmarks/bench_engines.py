@@ -20,8 +20,7 @@ import numpy as np
 from sparklod_cli.codecs.formats import TILESET
 from sparklod_cli.codecs.tileset import to_tileset
 from sparklod_cli.io.reading import read_scene
-from tests.interop.engines.browser import Browser, Shown
-from tests.interop.engines.likeness import like_cesium, likeness, our_picture
+from tests.interop.engines import Browser, Shown, like_cesium, likeness, our_picture
 from tests.interop.pictures import cameras_around
 
 HEADINGS = ("scene", "engine", "first frame", "last frame", "levels asked for", "files", "MB", "PSNR", "seconds")

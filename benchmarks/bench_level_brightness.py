@@ -21,7 +21,7 @@ from sparklod_cli.cameras.framing import framing
 from sparklod_cli.lod import parts, quality
 from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.scene import Scene
-from tests.interop.engines.browser import Browser, Shown
+from tests.interop.engines import Browser, Shown
 from tests.interop.pictures import cameras_around
 
 #: Shares of the levels below level 0, and distances as multiples of the second view of `cameras_around`.

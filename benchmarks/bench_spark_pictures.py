@@ -15,8 +15,7 @@ import numpy as np
 
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.render.render_settings import SORTS, RasterSettings
-from tests.interop.page import Page
-from tests.interop.pictures import AROUND, Difference, cameras_around, compare
+from tests.interop.pictures import AROUND, Difference, Page, cameras_around, compare
 
 HEADINGS = (
     "scene",

@@ -38,7 +38,7 @@ from tests.cameras.known import (
     read_json,
     text_file,
 )
-from tests.interop import npm
+from tests.interop.node import folder_with
 
 #: What has to be said about a format that leaves things open.
 NO_LENS = Settings(size=SIZE, fov_y=FOV_Y)
@@ -583,7 +583,7 @@ def random_poses(count: int) -> list[NDArray[np.float64]]:
 def packages(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")
-    return npm.folder_with(
+    return folder_with(
         SPLAT_TRANSFORM, variable="SPLAT_TRANSFORM_DIR", request=request, tmp_path_factory=tmp_path_factory
     )
 

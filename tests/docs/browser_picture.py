@@ -1,6 +1,6 @@
 """Takes the picture of `sparklod view` in docs/tutorials/web-page.md: `python -m tests.docs.browser_picture`.
 
-SPARK_DIR names a folder whose node_modules has what `tests/interop/conftest.py` lists for pages.
+SPARK_DIR names a folder whose node_modules has what `PAGE` in `tests/interop/node.py` lists.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from PIL import Image
 from sparklod_cli.cli import run
 from tests.conftest import FIXTURES
 from tests.interop.node import Node
-from tests.interop.test_view import PROGRAM, Served, Tab
+from tests.interop.test_view import Served, Tab
 
 from .gallery import DOCS, folder_of
 
@@ -34,7 +34,7 @@ def main() -> None:
         tree, picture = Path(name) / "demo-lod.rad", Path(name) / "page.png"
         scene = str(FIXTURES / "demo.ply")
         assert run(["build-lod", scene, "--up", "-y", "--method", "quality", "-o", str(tree), "-q"]) == 0
-        tab = Tab(Node([str(PROGRAM), str(spark), chromium], Path(name) / "stderr.txt"))
+        tab = Tab(Node("view_page.mjs", spark, chromium, scratch=Path(name)))
         with Served(spark, tree, "--look-at", "0,3.4,9:0,1.1,0", "--fov", "50", "--budget", "10k") as url:
             tab.open(url, size=SIZE)
             tab.settled()

@@ -1,12 +1,11 @@
 """Draws the pictures of engines in the documentation anew: `python -m tests.docs.engine_pictures`.
 
-ENGINES_DIR names a folder whose node_modules has what `tests/interop/engines/__init__.py` lists. Chromium shows the
+ENGINES_DIR names a folder whose node_modules has what `ENGINES` in `tests/interop/node.py` lists. Chromium shows the
 demo scene in the pages that the documents give, with an environment but in CesiumJS.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import shutil
 import tempfile
@@ -20,9 +19,7 @@ from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, ROOT
-from tests.interop.engines import recipes
-from tests.interop.engines.browser import Browser, Shown
-from tests.interop.engines.conftest import detailed, sky, written
+from tests.interop.engines import GLB, Browser, Shown, detailed, sky, written
 from tests.part_files import tiled
 
 FOLDER = ROOT / "docs" / "images" / "engines"
@@ -48,13 +45,13 @@ def main() -> None:
     assert chromium, "Chromium is not installed"
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
-        shot = written(dataclasses.replace(detailed(), environment=sky()), Path(name), SIZE)
+        shot = written(detailed(sky()), Path(name), SIZE)
         browser = Browser(Path(os.environ["ENGINES_DIR"]), chromium, Path(name))
         for engine, settings in (("playcanvas", {}), ("babylon", None)):
             _save(engine, getattr(browser, engine)(shot.file, shot.camera, settings))
         splats = read_scene(FIXTURES / "demo.ply").splats
         inner = splats.take(np.linalg.norm(splats.center, axis=1) < WITHIN)
-        glb = Path(name) / recipes.GLB
+        glb = Path(name) / GLB
         sparklod_cli.write(glb, Scene(inner, up="-y"))
         _save("playcanvas-glb", browser.playcanvas_glb(glb, shot.camera))
         tileset = tiled(inner, Path(name), TILES)

@@ -1,70 +1,111 @@
-"""Fixtures that start the real Spark and other programs for splat files, or skip the test if they are missing."""
+"""Fixtures that start Spark, engines, and other programs for splat files, or skip the test if they are missing."""
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.interop import npm
-from tests.interop.foreign import PACKAGES, Foreign
-from tests.interop.page import Page
+import sparklod_cli
+from tests.interop import engines
+from tests.interop.engines import Browser, Shot, detailed, sky
+from tests.interop.foreign import Foreign, SplatTransform, SpzLibrary
+from tests.interop.node import ENGINES, FOREIGN, PAGE, SPARK, SPZ_LIBRARY, folder_with, require
+from tests.interop.pictures import Page
 from tests.interop.spark import Spark
 
-#: The version that these tests were written for; other versions may have other layouts and file names.
-SPARK = {"@sparkjsdev/spark": "2.2.0"}
-#: Packages for pictures: Spark, three.js, which it draws with, and the driver of the browser.
-PAGE = {**SPARK, "three": "0.187.0", "playwright-core": "1.65.1"}
+#: Makes the folder with packages that an environment variable names.
+Folder = Callable[[dict[str, str], str], Path]
 
 
 @pytest.fixture(scope="session")
-def spark_dir(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder whose node_modules has Spark: the one that SPARK_DIR names, or one that is installed here."""
-    return npm.folder_with(SPARK, variable="SPARK_DIR", request=request, tmp_path_factory=tmp_path_factory)
+def packages_in(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Folder:
+    return lambda packages, variable: folder_with(
+        packages, variable=variable, request=request, tmp_path_factory=tmp_path_factory
+    )
+
+
+@pytest.fixture(scope="session")
+def spark_dir(packages_in: Folder) -> Path:
+    return packages_in(SPARK, "SPARK_DIR")
+
+
+@pytest.fixture(scope="session")
+def page_dir(packages_in: Folder) -> Path:
+    return packages_in(PAGE, "SPARK_DIR")
+
+
+@pytest.fixture(scope="session")
+def engines_dir(packages_in: Folder) -> Path:
+    return packages_in(ENGINES, "ENGINES_DIR")
 
 
 @pytest.fixture(scope="session")
 def spark(spark_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Spark]:
-    """Spark's worker, started once for all tests."""
-    if shutil.which("node") is None:
-        pytest.skip("Node is not installed")
+    """Spark's worker."""
     process = Spark(spark_dir, tmp_path_factory.mktemp("spark-arrays"))
     yield process
     process.close()
 
 
-@pytest.fixture(scope="module")  # an engine draws its page again and again as long as that is open
-def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """Spark in a browser, started once for the tests of a module."""
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("Chromium is not installed (Debian's package chromium)")
-    if shutil.which("node") is None:
-        pytest.skip("Node is not installed")
-    if given := os.environ.get("SPARK_DIR"):  # it may have Spark alone, which all other tests can do with
-        missing = [name for name in PAGE if not (Path(given) / "node_modules" / name).is_dir()]
-        if missing:
-            pytest.skip(f"SPARK_DIR has no {' and no '.join(missing)}")
-    folder = npm.folder_with(PAGE, variable="SPARK_DIR", request=request, tmp_path_factory=tmp_path_factory)
-    browser = Page(folder, chromium, tmp_path_factory.mktemp("pictures"))
+@pytest.fixture(scope="session")
+def foreign(packages_in: Folder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Foreign]:
+    process = Foreign(packages_in(FOREIGN, "FOREIGN_DIR"), tmp_path_factory.mktemp("foreign-files"))
+    yield process
+    process.close()
+
+
+@pytest.fixture(scope="session")
+def splat_transform(engines_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SplatTransform]:
+    process = SplatTransform(engines_dir, tmp_path_factory.mktemp("columns"))
+    yield process
+    process.close()
+
+
+@pytest.fixture(scope="session")
+def spz_library(packages_in: Folder, tmp_path_factory: pytest.TempPathFactory) -> Iterator[SpzLibrary]:
+    process = SpzLibrary(packages_in(SPZ_LIBRARY, "SPZ_DIR"), tmp_path_factory.mktemp("spz-library"))
+    yield process
+    process.close()
+
+
+# Browsers live as long as a module: an engine draws its page again and again as long as that is open.
+
+
+@pytest.fixture(scope="module")
+def page(page_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """Spark in a browser."""
+    browser = Page(page_dir, require("chromium"), tmp_path_factory.mktemp("pictures"))
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="module")
+def browser(engines_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """A browser with the engines."""
+    browser = Browser(engines_dir, require("chromium"), tmp_path_factory.mktemp("pictures"))
     yield browser
     browser.close()
 
 
 @pytest.fixture(scope="session")
-def foreign_dir(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder whose node_modules has `PACKAGES`: the one that FOREIGN_DIR names, or one that is installed here."""
-    return npm.folder_with(PACKAGES, variable="FOREIGN_DIR", request=request, tmp_path_factory=tmp_path_factory)
+def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
+    """The demo scene, in which up, left and front differ, as Streamed SOG."""
+    return engines.written(detailed(), tmp_path_factory.mktemp("web"))
 
 
 @pytest.fixture(scope="session")
-def foreign(foreign_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Foreign]:
-    """The other programs, started once for all tests."""
-    if shutil.which("node") is None:
-        pytest.skip("Node is not installed")
-    process = Foreign(foreign_dir, tmp_path_factory.mktemp("foreign-files"))
-    yield process
-    process.close()
+def shot_with_sky(tmp_path_factory: pytest.TempPathFactory) -> Shot:
+    """The same scene with an environment, which is in its splats."""
+    return engines.written(detailed(sky()), tmp_path_factory.mktemp("web"))
+
+
+@pytest.fixture(scope="session")
+def sog(shot: Shot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Level 0 as a plain SOG, bundled and unbundled, by the names of the files."""
+    folder = tmp_path_factory.mktemp("sog")
+    files = {name: folder / name for name in (engines.SOG, "meta.json")}
+    for file in files.values():
+        sparklod_cli.write(file, sparklod_cli.read(shot.file))
+    return files

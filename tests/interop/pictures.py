@@ -1,4 +1,4 @@
-"""Draws the same views with sparklod and with Spark, and measures their difference."""
+"""Pictures of Spark in headless Chromium, and their differences from sparklod's pictures of the same views."""
 
 from __future__ import annotations
 
@@ -21,8 +21,99 @@ from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.viewers.cut import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit
-from tests.interop.page import Page
+from tests.interop.node import Node
 from tests.lod.sights import CutView
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of Spark.
+
+    Attributes:
+        rounded: (height, width, 4) float64 RGBA, 0..1, of a canvas of 8 bits, which rounds after every splat.
+        exact: the same of a float32 canvas, without rounding; may be above 1.
+        drawn: number of splats that Spark sorted.
+        nodes: (S,) nodes of the tree that Spark drew, ascending; None if the file has no tree.
+    """
+
+    rounded: NDArray[np.float64]
+    exact: NDArray[np.float32]
+    drawn: int
+    nodes: NDArray[np.uint32] | None
+
+
+@dataclass(frozen=True)
+class Request:
+    """Spark's request for a file of a scene.
+
+    Attributes:
+        name: of the file.
+        bytes: that were sent.
+        start: of the range of bytes that it asked for; None for the whole file.
+    """
+
+    name: str
+    bytes: int
+    start: int | None
+
+
+class Page:
+    """One browser with Spark, which shows one file at a time.
+
+    Args:
+        package_dir: the folder with node_modules.
+        chromium: path of the browser.
+        scratch: an empty folder for files.
+    """
+
+    def __init__(self, package_dir: Path, chromium: str, scratch: Path) -> None:
+        self._out = scratch / "picture"
+        self._node = Node("spark_page.mjs", package_dir, chromium, scratch=scratch)
+        self.close = self._node.close
+
+    def open(self, file: Path, camera: Camera, settings: RasterSettings, *, layout: str = "Ext", pages: int = 0) -> int:
+        """Load a file, for the size of `camera` and the planes of `settings`, and count its splats or nodes.
+
+        Args:
+            layout: "Packed" or "Ext", in which Spark keeps the splats.
+            pages: of 65,536 nodes, into which Spark fetches chunks of a RAD file as it needs them; 0 for all at once.
+        """
+        size = {"width": camera.width, "height": camera.height, "near": settings.near, "far": settings.far}
+        how = {"layout": layout, "paged": pages > 0, "pages": pages}
+        answer = self._node.ask({"do": "open", "path": str(file.resolve()), **size, **how})
+        return int(answer["lod"] or answer["numSplats"])
+
+    def requests(self) -> list[Request]:
+        """Return Spark's requests for the file and those beside it since it was opened, in order."""
+        found = self._node.ask({"do": "requests"})["requests"]
+        return [Request(each["name"], each["bytes"], each["range"] and each["range"][0]) for each in found]
+
+    def draw(self, camera: Camera, settings: RasterSettings, *, budget: int | None = None) -> Picture:
+        """Draw the picture of a camera.
+
+        Args:
+            camera: has the size that the page was opened with, a centred principal point and square pixels.
+            settings: only its `sort` is used.
+            budget: number of nodes of a tree at most.
+        """
+        answer = self._node.ask(
+            {
+                "do": "draw",
+                "viewToWorld": camera.camera_to_world.T.ravel().tolist(),
+                "fovy": float(np.degrees(camera.fov_y)),
+                "budget": budget,
+                "radial": settings.sort == "radial",
+                "out": str(self._out),
+            }
+        )
+        files, shape = answer["files"], (camera.height, camera.width, 4)
+        return Picture(
+            rounded=np.fromfile(files["rounded"], "u1").reshape(shape)[::-1] / 255,
+            exact=np.fromfile(files["exact"], "<f4").reshape(shape)[::-1],
+            drawn=answer["drawn"],
+            nodes=np.sort(np.fromfile(files["indices"], "<u4")) if "indices" in files else None,
+        )
+
 
 FOV_Y = math.radians(50)
 
@@ -58,7 +149,7 @@ class Difference:
 
 
 def cameras_around(center: NDArray[np.floating], width: int, height: int) -> list[Camera]:
-    """Returns a camera for each view of `AROUND`; they look at the centre of a scene whose up is -y."""
+    """Return a camera for each view of `AROUND`, looking at the centre of a scene whose up is -y."""
     middle, radius = framing(center)
     focal = height / 2 / math.tan(FOV_Y / 2)
     cameras = []
@@ -71,7 +162,7 @@ def cameras_around(center: NDArray[np.floating], width: int, height: int) -> lis
 
 
 def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
-    """Returns the nodes of sparklod's cut, ascending, without foveation."""
+    """Return the nodes of sparklod's cut without foveation, ascending."""
     assert held.tree is not None
     nodes = spark_nodes.unpack(spark_nodes.pack(held.splats, held.tree))
     view = CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)
@@ -82,7 +173,7 @@ def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
 def compare(
     page: Page, file: Path, cameras: Sequence[Camera], settings: RasterSettings, budget: int = 0
 ) -> Iterator[Difference]:
-    """Draws a file with each camera, by both programs, and yields the differences.
+    """Draw a file with each camera in both programs, and yield the differences.
 
     Args:
         page: the browser with Spark.
@@ -127,6 +218,6 @@ def _difference(
 
 
 def psnr(difference: NDArray[np.floating]) -> float:
-    """Returns the PSNR, in dB, of the differences of numbers of 0..1."""
+    """Return the PSNR, in dB, of differences of numbers of 0..1."""
     square = float(np.mean(np.square(difference, dtype=np.float64))) if difference.size else 0.0
     return 10 * math.log10(1 / square) if square else math.inf

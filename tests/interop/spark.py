@@ -14,17 +14,12 @@ from numpy.typing import NDArray
 from sparklod_cli.model.lod_tree import CHUNK_NODES
 from tests.interop.node import Node
 
-PROGRAM = Path(__file__).with_name("spark_load.mjs")
-
 #: ExtSplats: its two arrays of 16 bytes a splat.
 EXT0 = np.dtype([("center", "<f4", 3), ("alpha", "<f2"), ("padding", "<u2")])
 EXT1 = np.dtype([("rgb", "<f2", 3), ("log_scale", "<f2", 3), ("quat", "<u4")])
 #: A node of the LodTree. child_count is read as a word, so that a count beyond its uint16 is noticed.
 NODE = np.dtype([("center", "<f2", 3), ("size", "<f2"), ("child_count", "<u4"), ("child_start", "<u4")])
 assert EXT0.itemsize == EXT1.itemsize == NODE.itemsize == 16
-
-#: Bits of a coefficient in the SH arrays of PackedSplats, by degree from 1.
-PACKED_SH_BITS = (7, 8, 6)
 
 
 @dataclass(frozen=True)
@@ -36,7 +31,7 @@ class Reply:
     words: Mapping[str, NDArray[np.uint32]]
 
     def rows(self, name: str, dtype: np.dtype[Any]) -> NDArray[Any]:
-        """Returns (count,) structs of an array, without the rest of the last row that Spark allocates."""
+        """Return (count,) structs of an array, without the rest of the last row that Spark allocates."""
         return self.words[name].view(dtype)[: self.count]
 
 
@@ -99,7 +94,7 @@ class Spark:
     def __init__(self, package_dir: Path, scratch: Path) -> None:
         self._scratch = scratch
         self._asked = 0
-        self._node = Node([str(PROGRAM), str(package_dir)], scratch / "stderr.txt")
+        self._node = Node("spark_load.mjs", package_dir, scratch=scratch)
         self.close = self._node.close
 
     def _ask(
@@ -124,7 +119,7 @@ class Spark:
 
     @contextmanager
     def _files(self, arrays: Mapping[str, NDArray[np.uint32]]) -> Iterator[dict[str, str | list[str]]]:
-        """Writes arrays to files for a request: a path for each option, or several if its names are "option.0" etc."""
+        """Write arrays to files for a request: a path for each option, or several if its names are "option.0" etc."""
         paths: dict[str, str | list[str]] = {}
         files = []
         for name, words in arrays.items():
@@ -137,7 +132,7 @@ class Spark:
             file.unlink()
 
     def load(self, source: bytes | Path, *, lod: bool = False) -> ExtSplats:
-        """Loads a file, or the bytes of an SPZ file, as ExtSplats; `lod` builds a tree if it has none."""
+        """Load a file, or the bytes of an SPZ file, as ExtSplats; `lod` builds a tree if it has none."""
         reply = self._ask("loadExtSplats", source, {"lod": lod})
         ext0, ext1 = reply.rows("ext0", EXT0), reply.rows("ext1", EXT1)
         nodes = reply.words["lodTree"].view(NODE) if reply.lod else None
@@ -160,7 +155,7 @@ class Spark:
         codes: Mapping[str, NDArray[np.uint32]] | None = None,
         **options: Any,
     ) -> dict[str, NDArray[np.uint32]]:
-        """Loads a file in a layout, "Packed" or "Ext"; returns its arrays as (N, words), one row a splat.
+        """Load a file in a layout, "Packed" or "Ext"; returns its arrays as (N, words), one row a splat.
 
         `codes` is the palette of SH for a chunk of a RAD file: the arrays whose names have "Codes" of its first chunk.
         `options` go to the worker: `lod` builds a tree, `encoding` sets the ranges of PackedSplats.
@@ -170,7 +165,7 @@ class Spark:
         return {name: words.reshape(-1, width.get(name, 4))[: reply.count] for name, words in reply.words.items()}
 
     def keep_tree(self, words: NDArray[np.uint32]) -> int:
-        """Loads a LodTree, four words a node, into Spark's worker; returns its id."""
+        """Load a LodTree, four words a node, into Spark's worker; returns its id."""
         path = self._scratch / "tree"
         words.tofile(path)
         tree: int = self._node.ask({"method": "initLodTree", "path": str(path)})["lodId"]
@@ -178,17 +173,17 @@ class Spark:
         return tree
 
     def new_pool(self, pages: int) -> int:
-        """Makes a page pool in Spark's worker, for trees that are loaded chunk by chunk; returns its id."""
+        """Make a page pool in Spark's worker, for trees that are loaded chunk by chunk; returns its id."""
         pool: int = self._node.ask({"method": "newLodTree", "options": {"capacity": pages * CHUNK_NODES}})["lodId"]
         return pool
 
     def new_paged_tree(self, pool: int) -> int:
-        """Makes a tree in a page pool, none of its chunks resident; returns its id."""
+        """Make a tree in a page pool, none of its chunks resident; returns its id."""
         tree: int = self._node.ask({"method": "newSharedLodTree", "options": {"lodId": pool}})["lodId"]
         return tree
 
     def update_pages(self, updates: Sequence[PageUpdate]) -> None:
-        """Puts chunks of trees into pages and removes others, in this order."""
+        """Put chunks of trees into pages and removes others, in this order."""
         ranges: list[dict[str, int]] = []
         path, nodes = self._scratch / "tree", 0
         with path.open("wb") as file:
@@ -210,7 +205,7 @@ class Spark:
     def traverse(
         self, budget: int, smallest: float, instances: Sequence[Mapping[str, Any]], mode: str = "standard"
     ) -> Traversed:
-        """Finds a cut, as `SparkRenderer` does.
+        """Find a cut, as `SparkRenderer` does.
 
         Args:
             budget: number of splats at most.
@@ -232,25 +227,9 @@ class Spark:
         chunks = [(tree, chunk) for tree, chunk in answer["chunks"]]
         return Traversed(np.split(indices, np.cumsum(answer["counts"])[:-1]), chunks, answer["pixelLimit"])
 
-    def load_packed_sh(self, source: bytes) -> NDArray[np.float64]:
-        """Returns the (N, K, 3) SH coefficients of a file in Spark's other layout, PackedSplats."""
-        reply = self._ask("loadPackedSplats", source, {})
-        parts = [np.zeros((reply.count, 0))]
-        for degree, bits in enumerate(PACKED_SH_BITS, 1):
-            if f"sh{degree}" not in reply.words:
-                break
-            size = 3 * (2 * degree + 1)
-            words = reply.words[f"sh{degree}"].reshape(-1, 2 if degree == 1 else 4)[: reply.count]
-            # Two's-complement numbers follow each other without gaps, also across words.
-            stream = np.unpackbits(words.view(np.uint8), axis=1, bitorder="little")[:, : size * bits]
-            weight = 2.0 ** np.arange(bits)
-            weight[-1] *= -1
-            parts.append(stream.reshape(reply.count, size, bits) @ weight / (2 ** (bits - 1) - 1))
-        return np.concatenate(parts, axis=1).reshape(reply.count, -1, 3)
-
 
 def _decode_quat(code: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Decodes quaternions: the axis in 10 + 10 bits of an octahedral map, the angle of 0..pi in 12 bits."""
+    """Decode quaternions: the axis in 10 + 10 bits of an octahedral map, the angle of 0..pi in 12 bits."""
     xy = np.stack([code & 1023, code >> 10 & 1023], axis=1) / 1023 * 2 - 1
     z = 1 - np.abs(xy).sum(axis=1, keepdims=True)
     xy -= np.copysign(np.maximum(-z, 0), xy)  # unfold the lower half
@@ -261,7 +240,7 @@ def _decode_quat(code: NDArray[np.uint32]) -> NDArray[np.float64]:
 
 
 def _decode_ext_sh(reply: Reply) -> NDArray[np.float64]:
-    """Decodes SH: a word a coefficient, with a byte and a sign for each of r, g and b, and one exponent for all.
+    """Decode SH: a word a coefficient, with a byte and a sign for each of r, g and b, and one exponent for all.
 
     sh1 has the three coefficients of degree 1 and the first of degree 2, sh2 the other four; sh3a and sh3b degree 3.
     """

@@ -7,8 +7,6 @@ import functools
 import hashlib
 import json
 import math
-import os
-import shutil
 import subprocess
 import sys
 import threading
@@ -33,20 +31,14 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.view.site import CDN, CESIUM, MODULES, PACKAGES, PLAYCANVAS, THREE, VERSIONS
 from tests.conftest import FIXTURES
-from tests.interop import npm
-from tests.interop.conftest import PAGE
-from tests.interop.engines import PACKAGES as ENGINES
-from tests.interop.engines.conftest import engines_dir as engines_dir
-from tests.interop.engines.likeness import like_cesium
-from tests.interop.node import Node
+from tests.interop.engines import like_cesium
+from tests.interop.node import ENGINES, PAGE, Node, require
 from tests.interop.pictures import psnr
 from tests.part_files import tiled
 from tests.scenes import random_splats
 from tests.signals import heed_signals
 
 pytestmark = pytest.mark.slow
-
-PROGRAM = Path(__file__).with_name("view_page.mjs")
 
 SIZE = 240, 136
 LOOK = ("--look-at", "0,-3.4,9:0,-1.1,0", "--fov", "40")
@@ -116,24 +108,9 @@ def pixels(path: Path) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 @pytest.fixture(scope="module")
-def packages(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder whose node_modules has all that the page and its driver need."""
-    if shutil.which("node") is None:
-        pytest.skip("Node is not installed")
-    if given := os.environ.get("SPARK_DIR"):
-        missing = [name for name in PAGE if not (Path(given) / "node_modules" / name).is_dir()]
-        if missing:
-            pytest.skip(f"SPARK_DIR has no {' and no '.join(missing)}")
-    return npm.folder_with(PAGE, variable="SPARK_DIR", request=request, tmp_path_factory=tmp_path_factory)
-
-
-@pytest.fixture(scope="module")
-def tab(packages: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    """A browser."""
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("Chromium is not installed (Debian's package chromium)")
-    node = Node([str(PROGRAM), str(packages), chromium], tmp_path_factory.mktemp("view") / "stderr.txt")
+def tab(page_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    """The tab of a browser."""
+    node = Node("view_page.mjs", page_dir, require("chromium"), scratch=tmp_path_factory.mktemp("view"))
     yield Tab(node)
     node.close()
 
@@ -152,8 +129,8 @@ def trees(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Served:
     """`sparklod view` as a process."""
 
-    def __init__(self, packages: Path, *arguments: object) -> None:
-        more = ["--spark-dir", packages, "--no-open", "-q", *arguments]
+    def __init__(self, page_dir: Path, *arguments: object) -> None:
+        more = ["--spark-dir", page_dir, "--no-open", "-q", *arguments]
         command = [sys.executable, "-m", "sparklod_cli", "view", *map(str, more)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heed_signals)
 
@@ -169,9 +146,9 @@ class Served:
 
 
 @pytest.fixture(scope="module")
-def shown(tab: Tab, packages: Path, trees: Path) -> Iterator[Tab]:
+def shown(tab: Tab, page_dir: Path, trees: Path) -> Iterator[Tab]:
     """The browser with the tree as SPZ."""
-    with Served(packages, trees / "demo.spz", *LOOK, "--budget", BUDGET) as url:
+    with Served(page_dir, trees / "demo.spz", *LOOK, "--budget", BUDGET) as url:
         tab.open(url)
         yield tab
 
@@ -187,9 +164,9 @@ def rendered(
     return pixels(out)
 
 
-def test_on_a_phone_the_panel_leaves_the_middle_of_the_scene_free(tab: Tab, packages: Path, trees: Path) -> None:
+def test_on_a_phone_the_panel_leaves_the_middle_of_the_scene_free(tab: Tab, page_dir: Path, trees: Path) -> None:
     width, height = 390, 844
-    with Served(packages, trees / "demo.spz", "--budget", 1_000) as url:
+    with Served(page_dir, trees / "demo.spz", "--budget", 1_000) as url:
         open_slowly(tab, url, trees / "demo.spz", (width, height))
         targets = tab.ask("targets")["targets"]
         assert {"panel-hide", "help-open", "budget", "levels", "orbit", "copy"} <= targets.keys()
@@ -219,12 +196,11 @@ def open_slowly(tab: Tab, url: str, file: Path, size: tuple[int, int] = SIZE) ->
 
 
 @pytest.fixture(scope="module")
-def others(packages: Path, tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Path:
+def others(page_dir: Path, engines_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder whose node_modules has PlayCanvas, CesiumJS and three.js."""
-    engines: Path = request.getfixturevalue("engines_dir")
     folder = tmp_path_factory.mktemp("others")
     (folder / "node_modules").mkdir()
-    for package, source in ((PLAYCANVAS, engines), (CESIUM, engines), (THREE, packages)):
+    for package, source in ((PLAYCANVAS, engines_dir), (CESIUM, engines_dir), (THREE, page_dir)):
         (folder / "node_modules" / package).symlink_to(source / "node_modules" / package)
     return folder
 
@@ -285,16 +261,16 @@ def eye_of(camera: str) -> list[float]:
     return [float(value) for value in camera.partition("=")[2].partition(":")[0].split(",")]
 
 
-def test_the_digests_are_those_of_the_packages(packages: Path) -> None:
+def test_the_digests_are_those_of_the_packages(page_dir: Path) -> None:
     assert {name: PAGE[name] for name in PACKAGES["spark"]}.items() <= VERSIONS.items()
-    check_digests(packages, PACKAGES["spark"])
+    check_digests(page_dir, PACKAGES["spark"])
 
 
-def check_digests(packages: Path, names: Collection[str]) -> None:
+def check_digests(page_dir: Path, names: Collection[str]) -> None:
     """Assert that modules of packages have the digests by which the page asks a CDN for them."""
     for (package, path), digest in MODULES.items():
         if package in names:
-            data = (packages / "node_modules" / package / path).read_bytes()
+            data = (page_dir / "node_modules" / package / path).read_bytes()
             assert base64.b64encode(hashlib.sha384(data).digest()).decode() == digest, path
 
 
@@ -369,21 +345,21 @@ def test_a_dropped_path_plays(shown: Tab) -> None:
     assert shown.ask("message")["text"].startswith("scene.ply cannot be played: scene.ply: its content is of no known")
 
 
-def test_a_rad_tree_is_paged(tab: Tab, packages: Path, trees: Path, tmp_path: Path) -> None:
-    with Served(packages, trees / "demo.rad", trees / "demo.spz", *LOOK, "--budget", BUDGET) as url:
+def test_a_rad_tree_is_paged(tab: Tab, page_dir: Path, trees: Path, tmp_path: Path) -> None:
+    with Served(page_dir, trees / "demo.rad", trees / "demo.spz", *LOOK, "--budget", BUDGET) as url:
         state = open_slowly(tab, url, trees / "demo.rad")
         assert (state["paged"], state["chunks"], state["meshes"], state["faults"]) == ([True, False], "1 of 1", 2, [])
         tab.ask("fill", id="budget", value="0")  # of both together
         assert 0 < tab.settled()["drawn"] <= 1_000
 
 
-def test_a_rad_tree_with_sh_of_degree_3_is_paged_whole(tab: Tab, packages: Path, tmp_path: Path) -> None:
+def test_a_rad_tree_with_sh_of_degree_3_is_paged_whole(tab: Tab, page_dir: Path, tmp_path: Path) -> None:
     """Spark 2.2.0 has no texture for the second array of degree 3 of paged ExtSplats, and stops at the first chunk."""
     near, far = random_splats(3_000, sh_degree=3, extent=0.02), random_splats(56_000, sh_degree=3, seed=1)
     splats = Splats.concat([near, replace(far, center=far.center + np.float32([0, 0, -20]))])
     splats = replace(splats, sh=splats.sh * np.float32(0.3))  # weak ones lose less as ExtSplats, if these can be had
     write(tmp_path / "sh3.rad", Scene(*quick.build(splats)))
-    with Served(packages, tmp_path / "sh3.rad", "--look-at", "0,0,0.06:0,0,0", "--budget", 4_000) as url:
+    with Served(page_dir, tmp_path / "sh3.rad", "--look-at", "0,0,0.06:0,0,0", "--budget", 4_000) as url:
         tab.open(url)
         tab.until(lambda state: state["chunks"] == "2 of 2")
         state = tab.settled()
@@ -404,9 +380,9 @@ def test_errors_of_the_engine_are_listed_in_the_panel(how: str, shown: Tab) -> N
 
 
 def test_an_exported_site_works_without_sparklod_and_without_ranges(
-    tab: Tab, packages: Path, trees: Path, tmp_path: Path
+    tab: Tab, page_dir: Path, trees: Path, tmp_path: Path
 ) -> None:
-    command = ["view", str(trees / "demo.rad"), *LOOK, "--budget", str(BUDGET), "--spark-dir", str(packages), "-q"]
+    command = ["view", str(trees / "demo.rad"), *LOOK, "--budget", str(BUDGET), "--spark-dir", str(page_dir), "-q"]
     assert run([*command, "--export", str(tmp_path / "public" / "site")]) == 0
 
     class Quiet(SimpleHTTPRequestHandler):

@@ -21,20 +21,20 @@ import pytest
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ext_splats, spark_nodes, spz
 from sparklod_cli.io.reading import read_scene
+from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
-from tests.conftest import FIXTURES, real_scene
-from tests.interop.laws import degrees_between
+from tests.codecs.cases import encode, rotation_degrees
+from tests.conftest import FIXTURES, Capture, real_scene
 from tests.interop.spark import Spark
 
 pytestmark = pytest.mark.slow
 
 #: Values of Spark's option `lod` for its two builders, the tiny one and Bhattacharyya's, by sparklod's methods.
 BUILDERS: dict[str, Any] = {"quick": True, "quality": "quality"}
-CHUNK = 65_536
 
 
 def spark_tree(spark: Spark, source: Path, builder: str) -> Scene:
-    """Returns the tree that Spark builds from a file, as it holds it in memory."""
+    """Return the tree that Spark builds from a file, as it has it in memory."""
     words = spark.load_words("Ext", source, lod=BUILDERS[builder])
     nodes = spark_nodes.unpack({"lod_tree": words.pop("lodTree")})
     return Scene(ext_splats.unpack(words), nodes.tree)
@@ -102,7 +102,7 @@ class Tree:
                     frontier.append(child)
 
     def codes(self) -> set[str]:
-        """Returns the codes of the findings that the tree should have, but for the order of its nodes."""
+        """Return the codes of the expected findings, except about the order of nodes."""
         count, nodes = len(self), range(len(self))
         leaf = [not children for children in self.child_count]
         wrong = {
@@ -122,17 +122,17 @@ class Tree:
         return {code for code, found in wrong.items() if found}
 
     def rise(self) -> float:
-        """Returns the largest ratio of the median `need` of a sixteenth of the file to that of an earlier one."""
+        """Return the largest ratio of the median `need` of a sixteenth of the file to that of an earlier one."""
         ends = [part * len(self) // 16 for part in range(17)]
         medians = [median(self.need[node] for node in range(*ends[part : part + 2])) for part in range(16)]
         return max(later / before for part, later in enumerate(medians) for before in medians[:part])
 
     def coarse_cut(self) -> set[int]:
-        """Returns the cut that refines the largest node first, as long as it has no more nodes than a chunk."""
+        """Return the cut that refines the largest node first, as long as it has no more nodes than a chunk."""
         cut, heap = set(), [(-self.size[0], 0)]
         while heap:
             _, node = heapq.heappop(heap)
-            if self.child_count[node] and len(cut) + len(heap) + self.child_count[node] > CHUNK:
+            if self.child_count[node] and len(cut) + len(heap) + self.child_count[node] > CHUNK_NODES:
                 return cut | {node} | {other for _, other in heap}
             if not self.child_count[node]:
                 cut.add(node)
@@ -141,7 +141,7 @@ class Tree:
         return cut
 
     def check_facts(self, report: dict[str, Any]) -> None:
-        """Asserts that a report has the facts of this tree."""
+        """Assert that a report has the facts of this tree."""
         facts, levels = report["tree"], Counter(self.depth.values())
         leaves = [node for node in range(len(self)) if not self.child_count[node]]
         assert report["splats"] == len(self)
@@ -160,12 +160,12 @@ class Tree:
         children = Counter(count for count in self.child_count if count)
         assert facts["children"] == {str(count): times for count, times in children.items()}
         assert facts["more_than_opaque"] == pytest.approx(sum(d > 1 for d in self.d) / len(self), abs=1e-4)
-        assert facts["chunks"] == math.ceil(len(self) / CHUNK)
-        assert facts["chunks_of_coarse_cut"] == len({node // CHUNK for node in self.coarse_cut()})
+        assert facts["chunks"] == math.ceil(len(self) / CHUNK_NODES)
+        assert facts["chunks_of_coarse_cut"] == len({node // CHUNK_NODES for node in self.coarse_cut()})
 
 
-def inspected(path: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[str, Any]]:
-    """Runs `inspect --check`; returns its exit status and its report."""
+def inspected(path: Path, capsys: Capture, *options: str) -> tuple[int, dict[str, Any]]:
+    """Run `inspect --check`, and return its exit status and its report."""
     code = run(["inspect", str(path), "--json", "--check", *options])
     return code, json.loads(capsys.readouterr().out)
 
@@ -174,12 +174,12 @@ def inspected(path: Path, capsys: pytest.CaptureFixture[str], *options: str) -> 
     "name, builder", [("sh2.ply", "quality"), ("demo.ply", "quality"), ("demo.ply", "quick"), ("biker.ply", "quick")]
 )
 def test_facts_and_findings_of_sparks_trees_are_right(
-    spark: Spark, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, builder: str
+    spark: Spark, tmp_path: Path, capsys: Capture, name: str, builder: str
 ) -> None:
     """A fixture with SH, one without, and a real scene with more nodes than a chunk."""
     source = FIXTURES / name if (FIXTURES / name).exists() else real_scene(name)
     path = tmp_path / "tree.spz"
-    path.write_bytes(b"".join(spz.encode(spark_tree(spark, source, builder), threads=2)))
+    path.write_bytes(encode(spz, spark_tree(spark, source, builder), threads=2))
     code, report = inspected(path, capsys, "--fail-on", "warning")
     tree = Tree.read(path)
     tree.check_facts(report)
@@ -187,10 +187,10 @@ def test_facts_and_findings_of_sparks_trees_are_right(
     assert tree.codes() == set()  # Spark builds valid trees
     assert code == 0
     # The first 65,536 nodes are coarse before fine. The others follow part by part of the scene, which is a note.
-    if len(tree) > CHUNK:
+    if len(tree) > CHUNK_NODES:
         assert tree.rise() > 1.5
         assert [found["code"] for found in report["findings"]] == ["tree.coarse-first"]
-        assert report["findings"][0]["index"] > CHUNK
+        assert report["findings"][0]["index"] > CHUNK_NODES
     else:
         assert tree.rise() < 1.5 or len(tree) < 1000
         assert report["findings"] == []
@@ -198,19 +198,19 @@ def test_facts_and_findings_of_sparks_trees_are_right(
 
 @pytest.mark.parametrize("builder", BUILDERS)
 def test_leaves_of_sparks_trees_are_the_splats_but_for_small_rotations(
-    spark: Spark, tmp_path: Path, capsys: pytest.CaptureFixture[str], builder: str
+    spark: Spark, tmp_path: Path, capsys: Capture, builder: str
 ) -> None:
     """Spark's builders hold the w of a rotation as float16, which rounds it to 1 below 2.5 degrees."""
     source, path = FIXTURES / "demo.ply", tmp_path / "tree.spz"
     scene = spark_tree(spark, source, builder)
-    path.write_bytes(b"".join(spz.encode(scene)))
+    path.write_bytes(encode(spz, scene))
     code, report = inspected(path, capsys, "--leaves-of", str(source))
     original = read_scene(source).splats
     by_center = {tuple(center): quat for center, quat in zip(original.center.tolist(), original.quat_xyzw, strict=True)}
     assert scene.tree is not None
     leaves = scene.splats.take(scene.tree.is_leaf)
     quats = np.array([by_center[tuple(center)] for center in leaves.center.tolist()], np.float64)
-    turned = degrees_between(leaves.quat_xyzw, quats)
+    turned = rotation_degrees(leaves.quat_xyzw, quats)
     assert code == 3
     (found,) = (found for found in report["findings"] if found["code"] == "expect.leaves")
     assert 0 < np.count_nonzero(turned > 1) <= np.count_nonzero(turned > 0.5) < 1e-3 * len(leaves)
@@ -219,6 +219,6 @@ def test_leaves_of_sparks_trees_are_the_splats_but_for_small_rotations(
     assert turned.max() < 2.6
     # Without such small rotations, the leaves are the splats.
     needle = tmp_path / "needle.spz"
-    needle.write_bytes(b"".join(spz.encode(spark_tree(spark, FIXTURES / "needle.ply", builder))))
+    needle.write_bytes(encode(spz, spark_tree(spark, FIXTURES / "needle.ply", builder)))
     code, report = inspected(needle, capsys, "--leaves-of", str(FIXTURES / "needle.ply"))
     assert (code, report["tree"]["leaves"]) == (0, 60)

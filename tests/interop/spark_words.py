@@ -1,4 +1,4 @@
-"""Compares sparklod's words with Spark's, which may differ only where a value is half-way between two codes.
+"""Compares the words of splats in Spark's two layouts, as its worker has them, with those of sparklod.
 
 The last bit of a logarithm, or of a number decoded from a file, may differ between Spark's float32 and sparklod's (and
 the float64 of Spark's JavaScript). That changes a code only if the value is a tie but for last bits; then by one.
@@ -6,15 +6,22 @@ the float64 of Spark's JavaScript). That changes a code only if the value is a t
 
 from __future__ import annotations
 
+import re
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.codecs import ext_splats, packed_splats, spark_codings
-from sparklod_cli.codecs.spark_codings import SplatEncoding
+from sparklod_cli.codecs import ext_splats, packed_splats, spark_codings, spark_nodes
+from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
+from sparklod_cli.io.reading import read_scene
+from sparklod_cli.model import gaussian
 from sparklod_cli.model.gaussian import lod_opacity
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
+from tests.interop.spark import Spark
 
 Words = dict[str, NDArray[np.uint32]]
 Floats = NDArray[np.floating[Any]]
@@ -29,7 +36,7 @@ def linear(values: Floats, low: float, high: float, most: int) -> Steps:
 
 
 def half(values: Floats) -> Steps:
-    """Returns values in units of the last place of their float16."""
+    """Return values in units of the last place of their float16."""
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         steps = values.astype(np.float64) / np.spacing(np.abs(values).astype(np.float16)).astype(np.float64)
     return steps, np.abs(steps) * LAST_BITS
@@ -95,7 +102,7 @@ def ext_codes(words: Words) -> dict[str, NDArray[Any]]:
 def check(
     ours: dict[str, NDArray[Any]], theirs: dict[str, NDArray[Any]], steps: dict[str, Steps], share: float
 ) -> None:
-    """Asserts that all codes are equal, but for a share of ties that last bits decide."""
+    """Assert that all codes are equal, but for a share of ties that last bits decide."""
     assert ours.keys() == theirs.keys() == steps.keys()
     for name, (value, error) in steps.items():
         one, other = ours[name], theirs[name]
@@ -107,3 +114,60 @@ def check(
         assert (np.abs(one.astype(int) - other.astype(int))[differ] == 1).all(), name
         off = np.abs(value % 1 - 0.5)[differ] / np.broadcast_to(error, value.shape)[differ]
         assert off.max(initial=0) <= 1, f"{name} differs {off.max()} times as far from a tie as last bits reach"
+
+
+def spark_encoding(encoding: SplatEncoding) -> dict[str, Any]:
+    """Return an encoding by Spark's names."""
+    return {re.sub("_(.)", lambda match: match[1].upper(), name): value for name, value in asdict(encoding).items()}
+
+
+def check_file(spark: Spark, path: Path, share: float, encoding: SplatEncoding = DEFAULT) -> None:
+    """Compare both layouts and the tree of a file: those of Spark's worker, and ours of the same file.
+
+    Args:
+        share: of codes that ties may decide, see `ties`.
+        encoding: that Spark's worker is asked for; files with an encoding of their own have that instead.
+    """
+    scene = read_scene(path)
+    encoding = SplatEncoding(**asdict(encoding) | {"lod_opacity": scene.tree is not None})
+    check_packed(spark.load_words("Packed", path, encoding=spark_encoding(encoding)), scene, encoding, share)
+    check_ext(spark.load_words("Ext", path), scene, share)
+
+
+def check_packed(theirs: Words, scene: Scene, encoding: SplatEncoding, share: float) -> None:
+    """Compare Spark's PackedSplats and tree of a scene with ours."""
+    ours = packed_splats.pack(scene.splats, encoding)
+    check(packed_codes(ours), packed_codes(theirs), packed_steps(scene.splats, encoding), share)
+    assert theirs.keys() - {"lodTree"} == ours.keys()
+    for name in ours.keys() - {"packed"}:
+        np.testing.assert_array_equal(ours[name], theirs[name])
+    if scene.tree:
+        held = packed_splats.unpack({"packed": theirs["packed"]}, encoding)
+        check_tree(spark_nodes.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
+
+
+def check_ext(theirs: Words, scene: Scene, share: float) -> None:
+    """Compare Spark's ExtSplats and tree of a scene with ours."""
+    ours = ext_splats.pack(scene.splats)
+    np.testing.assert_array_equal(ours["ext0"][:, :3], theirs["ext0"][:, :3])
+    check(ext_codes(ours), ext_codes(theirs), ext_steps(scene.splats), share)
+    assert theirs.keys() - {"lodTree"} == ours.keys()
+    np.testing.assert_array_equal(ext_sh(ours), ext_sh(theirs))
+    if scene.tree:
+        held = ext_splats.unpack({name: theirs[name] for name in ("ext0", "ext1")})
+        check_tree(spark_nodes.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
+
+
+def ext_sh(words: Words) -> NDArray[np.uint32]:
+    """Return the words of SH without unused ones, in which Spark leaves what its buffer had before."""
+    names = [name for name in ("sh1", "sh2", "sh3a", "sh3b") if name in words]
+    everything = np.concatenate([words["ext0"][:, :0], *(words[name] for name in names)], axis=1)
+    return everything[:, : (0, 3, 8, 0, 15)[len(names)]]
+
+
+def check_tree(ours: NDArray[np.uint32], theirs: NDArray[np.uint32], held: Splats, share: float) -> None:
+    one, other = (words.view(spark_nodes.NODE)[:, 0] for words in (ours, theirs))
+    for name in ("center", "child_count", "child_start"):
+        np.testing.assert_array_equal(one[name], other[name])
+    steps, error = half(gaussian.spark_size(held))
+    check({"size": one["size"]}, {"size": other["size"]}, {"size": (steps, 4 * error)}, share)

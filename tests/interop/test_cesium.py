@@ -22,10 +22,9 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.viewers.cesium import choose
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.conftest import FIXTURES, ROOT
-from tests.interop.engines import PACKAGES, recipes
-from tests.interop.engines.browser import Browser, Shown
-from tests.interop.engines.conftest import SIZE
-from tests.interop.engines.likeness import like_cesium, likeness
+from tests.interop import engines
+from tests.interop.engines import SIZE, Browser, Shown, like_cesium, likeness
+from tests.interop.node import ENGINES
 from tests.interop.pictures import cameras_around
 from tests.part_files import tiled
 
@@ -65,7 +64,7 @@ def tileset(splats: Splats, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def view(splats: Splats, away: float = NEAR) -> Camera:
-    """A camera that sees the scene from the side, at so many times the distance of one that sees all of it."""
+    """A camera that sees the scene from the side, at a multiple of the distance from which all of it is seen."""
     camera = cameras_around(splats.center, *SIZE)[1]
     pose = camera.camera_to_world.copy()
     middle = np.median(splats.center, axis=0)
@@ -74,12 +73,12 @@ def view(splats: Splats, away: float = NEAR) -> Camera:
 
 
 def drawn(file: Path, shown: Shown) -> Splats:
-    """The splats of the tiles that a page showed."""
+    """The splats of the tiles in a picture."""
     return Splats.concat([read_scene(file.parent / name).splats for name in shown.tiles])
 
 
 def check(shown: Shown, ours: NDArray[np.float32]) -> None:
-    """Asserts that a picture is ours, and that it would be noticed if it were turned, mirrored or empty."""
+    """Assert that a picture is ours, and that the test would notice if it were turned, mirrored or empty."""
     rgba = shown.rgba
     seen = ours[..., 3] > 0.1
     assert seen.mean() > SEEN
@@ -169,5 +168,5 @@ def test_it_shows_a_scene_that_stands_on_the_earth(browser: Browser, splats: Spl
 
 def test_the_page_names_the_version_that_is_tested() -> None:
     text = (ROOT / "docs" / "cesium.md").read_text(encoding="utf-8")
-    assert set(re.findall(r"cesium@(\d+\.\d+\.\d+)", text)) == {PACKAGES["cesium"]}
-    assert recipes.cesium()
+    assert set(re.findall(r"cesium@(\d+\.\d+\.\d+)", text)) == {ENGINES["cesium"]}
+    assert engines.cesium()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -35,33 +34,20 @@ SCENES = 6
 @pytest.fixture(scope="module")
 def engine(engines_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
     """PlayCanvas's modules in Node."""
-    if shutil.which("node") is None:
-        pytest.skip("Node is not installed")
-    program = Path(__file__).with_name("detail_choice.mjs")
-    process = Node([str(program), str(engines_dir)], tmp_path_factory.mktemp("engine") / "stderr.txt")
+    process = Node("detail_choice.mjs", engines_dir, scratch=tmp_path_factory.mktemp("engine"))
     yield process
     process.close()
 
 
 def manifest(regions: Regions) -> dict[str, Any]:
-    """What the engine reads of lod-meta.json; its tree is a list in this test."""
-    levels = regions.counts.shape[1]
-    leaves = [
-        {
-            "bound": {"min": low.tolist(), "max": high.tolist()},
-            "lods": {
-                str(level): {"file": level, "offset": 0, "count": int(count)}
-                for level, count in enumerate(counts)
-                if count
-            },
-        }
-        for (low, high), counts in zip(regions.bounds, regions.counts, strict=True)
-    ]
-    return {
-        "lodLevels": levels,
-        "filenames": [f"{level}_0/meta.json" for level in range(levels)],
-        "tree": {"children": leaves},
-    }
+    """The part of lod-meta.json that the engine reads; its tree is a list in this test."""
+    levels, leaves = range(regions.counts.shape[1]), []
+    for (low, high), counts in zip(regions.bounds, regions.counts, strict=True):
+        runs = {str(level): {"file": level, "offset": 0, "count": int(counts[level])} for level in levels}
+        held = {level: run for level, run in runs.items() if run["count"]}
+        leaves.append({"bound": {"min": low.tolist(), "max": high.tolist()}, "lods": held})
+    filenames = [f"{level}_0/meta.json" for level in levels]
+    return {"lodLevels": len(levels), "filenames": filenames, "tree": {"children": leaves}}
 
 
 def seen_by(view: CutView) -> dict[str, Any]:
@@ -73,7 +59,7 @@ def seen_by(view: CutView) -> dict[str, Any]:
 
 
 def placed(random: np.random.Generator) -> np.ndarray:
-    """A turn, a uniform scale and a move."""
+    """A matrix of a rotation, a uniform scale and a translation."""
     matrix = random_view(random, 20.0).camera_to_world
     matrix[:3, :3] *= random.lognormal(0, 0.5)
     return matrix
@@ -94,27 +80,18 @@ def test_levels_are_those_of_playcanvas(name: str, engine: Node) -> None:
         views = [random_view(random) for _ in range(4)]
         finest = sum(int(scene.counts[:, 0].sum()) for scene in scenes)
         budgets = [1, *(int(share * finest) for share in (0.05, 0.2, 0.5, 0.9)), 2 * finest]
-        found = engine.ask(
+        chosen = {"lodMultiplier": rule.multiplier, "lodRangeMin": rule.finest, "lodRangeMax": rule.coarsest}
+        manifests = [
             {
-                "manifests": [
-                    {
-                        "data": manifest(scene),
-                        "matrix": matrix.T.ravel().tolist(),
-                        "settings": {
-                            "lodBaseDistance": base,
-                            "lodMultiplier": rule.multiplier,
-                            "lodRangeMin": rule.finest,
-                            "lodRangeMax": rule.coarsest,
-                        },
-                    }
-                    for scene, matrix, base in zip(scenes, matrices, bases, strict=True)
-                ],
-                "cameras": list(map(seen_by, views)),
-                "budgets": budgets,
-                "mode": rule.mode,
-                "params": {"lodBehindPenalty": rule.behind_penalty, "lodDistanceShrink": rule.shrink},
+                "data": manifest(scene),
+                "matrix": matrix.T.ravel().tolist(),
+                "settings": {"lodBaseDistance": base, **chosen},
             }
-        )["found"]
+            for scene, matrix, base in zip(scenes, matrices, bases, strict=True)
+        ]
+        params = {"lodBehindPenalty": rule.behind_penalty, "lodDistanceShrink": rule.shrink}
+        request = {"manifests": manifests, "cameras": list(map(seen_by, views)), "budgets": budgets}
+        found = engine.ask({**request, "mode": rule.mode, "params": params})["found"]
         for view, answer in zip(views, found, strict=True):
             distances = [
                 RegionBounds(scene.bounds).squared_distances(view, matrix, rule)
