@@ -85,7 +85,7 @@ SPZ_RANGES = tuple(CodeRange(column, low, high) for column, (low, high) in quant
 
 
 def windows_of(count: int) -> list[slice]:
-    """Return the windows of a file of so many splats."""
+    """Divide the splats of a file into windows."""
     return blocks_of(count, CHUNK_NODES)
 
 

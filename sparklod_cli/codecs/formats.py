@@ -1,4 +1,4 @@
-"""The tables of file formats and of layouts in a viewer's memory, and the names of files that stand beside each other.
+"""Tables of file formats and of layouts in a viewer's memory, and the names of the files that make up a scene.
 
 Adding a format is a module and a row here. Imports nothing heavy: `--help` names them.
 """
@@ -116,7 +116,7 @@ FORMATS = (
         parts="tiles",
         keys=("geometricError",),
     ),
-    # The same as JSON, whose keys stand in any order; a meta.json of SOG is JSON, too.
+    # GLB as JSON, whose keys are in any order; a meta.json of SOG is JSON, too.
     Format(
         "glTF",
         "gltf",
@@ -246,7 +246,7 @@ LOOKALIKES: tuple[tuple[str, bytes | None, tuple[str, ...]], ...] = (
 
 
 def lookalike_of(head: bytes) -> str | None:
-    """Return the text of a file of no known format by its first bytes; None if these tell nothing."""
+    """Describe a file of no known format by its first bytes; None if they do not identify it."""
     keys = _keys(head)
     for text, beginning, wanted in LOOKALIKES:
         if beginning is not None and re.match(beginning, head):

@@ -138,5 +138,5 @@ class WriteOptions(CheckedSettings):
     )
 
 
-#: What is written where nobody chooses.
+#: Options that leave every choice to the writer.
 DEFAULTS = WriteOptions()

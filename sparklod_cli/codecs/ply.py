@@ -83,7 +83,7 @@ FEW = 4
 #: pixel wherever a disk is smaller than a picture, and above 0, which formats of logarithms do not hold. Chosen.
 THIN = np.float32(1e-3)
 
-#: Numbers that are none as C libraries of Windows write them: "-nan(ind)", "1.#QNAN", "-1.#INF00".
+#: Values that are not numbers, as C libraries of Windows write them: "-nan(ind)", "1.#QNAN", "-1.#INF00".
 WINDOWS_NAN = re.compile(rb"(?<!\S)([+-]?)(?:nan\([^\s()]*\)|1[.,]#(inf)?\w*)(?!\S)", re.IGNORECASE)
 
 
@@ -461,7 +461,7 @@ CHUNK_SPLATS = 256
 #: Properties of a splat, uint32 each.
 VERTEX = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
-#: Properties of the bounds of a chunk, by what they bound; old files have no bounds of colours.
+#: Properties of a chunk: the bounds of each quantity; old files have no bounds of colours.
 BOUNDS = {
     "position": ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z"),
     "scale": ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z"),  # logarithms

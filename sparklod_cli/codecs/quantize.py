@@ -333,7 +333,7 @@ def decode_centred_8(codes: Bytes) -> FloatArray:
 #: more is larger than any code, such as a sky, and shrinks: a denser middle would not be more like it.
 MOST_GROWTH = 1.125
 
-#: Smallest factor, of what is smaller than any code: a pixel shows it all the same.
+#: Smallest factor, for splats smaller than any code: a pixel shows such a splat all the same.
 LEAST_GROWTH = 1 / 16
 
 #: The smallest float32 above 1.

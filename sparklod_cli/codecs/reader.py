@@ -1,4 +1,4 @@
-"""Files as streams of rows, in blocks so that no file is in memory as a whole; their notes; checks of what they hold.
+"""Readers of files in blocks, so that no file is in memory as a whole; notes in files; checks of their splats.
 
 Formats without a field for it hold a note of sparklod: a JSON object with "generator". It is the comment of a RAD, PLY
 or SPZ file, and "asset" of a SOG or a Streamed SOG, which may have more keys.

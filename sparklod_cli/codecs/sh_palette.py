@@ -190,11 +190,11 @@ class _Clustering:
         return table[used], compact.astype(np.uint32)
 
     def _bisect(self, codes: int) -> tuple[Indices, Offsets]:
-        """Divide the rows into cells, fewer than `codes` only if rows are too near to be told apart.
+        """Divide the rows into cells: `codes` of them, or fewer if rows are too near each other.
 
-        Every cell is halved when it is made, which tells what it gains to have both halves; then those that gain most
-        are replaced by theirs. Returns (M,) rows, cell after cell, neighbours near each other, and (C + 1,) where each
-        begins.
+        Every new cell is halved at once, which shows by how much the error shrinks if both halves replace it; then the
+        cells with the largest gain are replaced by their halves. Returns (M,) rows, cell after cell, neighbours near
+        each other, and (C + 1,) where each cell begins.
         """
         from .kernels.sh_clustering import halve_cells
 

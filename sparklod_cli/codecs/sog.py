@@ -51,6 +51,8 @@ from .sog_images import (
 )
 from .zip_folder import ZipFolder
 
+# Files of a scene: meta.json and images, in a zip or a folder. Sizes are checked before decoding.
+
 #: Sides of images are multiples of this, as PlayCanvas makes them.
 STEP = 4
 
@@ -197,13 +199,15 @@ def zipped(files: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
     yield buffer.getvalue()[done:]
 
 
+# Reading.
+
 #: Most entries of the palette of SH: a label has 16 bits.
 MAX_PALETTE = 1 << 16
 
 #: Most splats: a WebP image has at most this many texels.
 MAX_SPLATS = 1 << 28
 
-#: Where the channels stand in a pixel.
+#: Shifts of the channels in a pixel.
 RED_GREEN_BLUE, ALPHA = np.array([16, 8, 0], np.uint32), np.array([24], np.uint32)
 
 
@@ -297,7 +301,7 @@ def _fill_words(place: int, splats: Splats, pixels: Pixels) -> None:
 
 
 def _finish(tables: FloatArray, splats: Splats) -> None:
-    """Decode coordinates, whose codes of 16 bits stand in their place."""
+    """Decode coordinates in the place of their codes of 16 bits."""
     texels.look_up_words(splats.center.view(np.uint32), tables, splats.center)
 
 
@@ -378,6 +382,8 @@ class SogPalette:
             return self._values
 
 
+# Writing.
+
 #: Power of the weights of splats in the palette of SH. With 1, pictures are better still, but the error of coefficients
 #: is larger than that of splat-transform's; benchmarks/notes/file-sizes.md has the measurements.
 SEEN = 0.5
@@ -390,7 +396,7 @@ LARGE = 1.0
 #: units. The bounds of Streamed SOG's regions leave room for it. Scenes whose scales differ by 1e30 exceed it.
 GROWTH, GROWTH_OF_LARGEST, GROWTH_OF_ALL = 4 / 3, 0.01, 1e-4
 
-#: Fewest codes of a palette where nobody chooses, and the steps in which it grows, as PlayCanvas's writer has them.
+#: Default number of codes of the smallest palette, and of the steps in which it grows, as in PlayCanvas's writer.
 LEAST_CODES = 1024
 
 #: Largest colour and SH coefficient: float32 holds the squares of their differences. Chosen.
@@ -472,7 +478,7 @@ def encode_files(
     splats = scene.splats
     low, high = (codings.sign_log(end) for end in (splats.center.min(axis=0), splats.center.max(axis=0)))
     words = codings.encode_center(splats.center, low, high)
-    # By what is written: the images get smaller than in the order of the centres, and a scene that is read from them
+    # The order of the codes: images get smaller than in the order of the centres, and a scene that was read from them
     # is written in the same order again.
     order = np.arange(len(splats)) if in_order else morton.order_of_cells(words)
     makers: dict[str, Callable[[], Texture]] = {
@@ -561,5 +567,5 @@ def _sh(palette: sh_palette.ShPalette, degree: int, order: Order) -> Texture:
 
 
 def _numbers(book: FloatArray) -> list[float]:
-    """Return the numbers of a book with as many digits as tell float32 apart."""
+    """Return the numbers of a book with as many digits as distinguish float32."""
     return [float(str(value)) for value in book]

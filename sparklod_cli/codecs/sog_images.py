@@ -98,7 +98,7 @@ def quat_components() -> FloatArray:
 
 
 def codebook(values: FloatArray, tilt: float = 0) -> FloatArray:
-    """Choose a book for some numbers.
+    """Choose a codebook for numbers.
 
     If at most 256 of them differ, the book has just these. Otherwise it has the least and the largest number, so that
     the range stays, and between them the means that k-means finds in one dimension, where it needs no more than sums up
@@ -189,7 +189,7 @@ def _means(ordered: NDArray[np.float64], codes: int, tilt: float) -> NDArray[np.
 
 Texels = NDArray[np.uint8]
 
-#: Effort of the encoder: quality tells how long it searches for repetitions, the method how many ways of coding it
+#: Effort of the encoder: quality sets how long it searches for repetitions, the method how many ways of coding it
 #: tries. Measured: with more, files get smaller by less than 0.3 % and take up to ten times as long.
 QUALITY, METHOD = 50, 1
 
@@ -202,7 +202,7 @@ Pixels = NDArray[np.uint32]
 #: Reads the next `size` bytes, or fewer, of which none are left at the end.
 Read = Callable[[int], bytes]
 
-#: Bytes that are read of any file at first: the headers of the file and of its first chunk, and what tells its sides.
+#: Bytes that are read first: the header of the file, that of its first chunk, and the sides.
 START = 30
 
 #: Most chunks that are read before that of the pixels: a colour profile, alpha, and some that are unknown.
@@ -213,7 +213,7 @@ ANIMATED = 2
 
 
 class WebPHeader(NamedTuple):
-    """First bytes of a WebP file, `start`, and what they say of its pixels."""
+    """First bytes of a WebP file, `start`, and the facts on its pixels in them."""
 
     start: bytes
     width: int

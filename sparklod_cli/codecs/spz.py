@@ -50,30 +50,6 @@ ANTIALIASED, EXTENSIONS, LOD = 0x01, 0x02, 0x80
 KNOWN_FLAGS = ANTIALIASED | EXTENSIONS | LOD
 
 
-#: Type of an extension record, and bytes of its payload.
-RECORD = struct.Struct("<II")
-
-#: Record of the coordinate system in which the coordinates stand: a uint32, an index of `SYSTEMS` from 1 on.
-COORDINATE_SYSTEM = 0xADBE0003
-
-#: The coordinate systems: where x, y and z point, of left or right, down or up, back or front.
-SYSTEMS = (
-    *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
-    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
-)
-
-#: By the axis that points up, the right-handed system whose x points right. None has x pointing up.
-SYSTEM_OF_UP = {"y": "RUB", "-y": "RDF", "z": "RFU", "-z": "RBD"}
-
-
-def extensions_of(up: str | None) -> bytes:
-    """Return the extension records of a file in which this axis points up, one of `SYSTEM_OF_UP`; b"" for None."""
-    if up is None:
-        return b""
-    number = SYSTEMS.index(SYSTEM_OF_UP[up]) + 1
-    return RECORD.pack(COORDINATE_SYSTEM, 4) + number.to_bytes(4, "little")
-
-
 class SpzStream(NamedTuple):
     """One stream of a file: one column of all splats in order.
 
@@ -133,7 +109,7 @@ class Layout:
                 3 * coefficients,  # coefficient-major, r g b innermost
                 "sh",
                 lambda codes: q.decode_sh(codes.reshape(-1, coefficients, 3)[:, : COEFFICIENTS[MAX_SH_DEGREE]]),
-                lambda sh: q.encode_sh(sh, ALL_BITS),  # what is dropped of them is by now, see `sh_codes`
+                lambda sh: q.encode_sh(sh, ALL_BITS),  # with fewer bits already, see `sh_codes`
             ),
         ]
         if self.flags & LOD:
@@ -151,22 +127,6 @@ class Layout:
 
 #: Some rows of a stream: the stream, which rows, and (n, size) bytes.
 StreamRows = tuple[SpzStream, slice, Bytes]
-
-#: Names of the other types that are published.
-TYPES = {0xADBE0002: "SPZ_ADOBE_safe_orbit_camera"}
-
-_DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "B": (0, 0, 1), "F": (0, 0, -1)}
-
-#: Bytes of extension records that are read of a file.
-MOST_EXTENSION_BYTES = 1 << 20
-
-#: Kinds of unknown records that are named.
-MOST_NAMED = 8
-
-#: Contents of the extension records of a file: the axis that points up, by the coordinate system; what is left out, as
-#: sentences for `Scene.notes`; and whether there is a coordinate system, be it an unknown one.
-Extensions = tuple[str | None, tuple[str, ...], bool]
-NO_EXTENSIONS: Extensions = (None, (), False)
 
 #: Versions that are read.
 READABLE = (1, 2, 3, 4)
@@ -362,6 +322,48 @@ def _open_v4(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows], d
     return layout, rows(), header, FileNote(), extensions
 
 
+# Extension records: the coordinate system is read and written, others are named.
+
+#: Type of an extension record, and bytes of its payload.
+RECORD = struct.Struct("<II")
+
+#: Record of the coordinate system of a file: a uint32, an index of `SYSTEMS` from 1 on.
+COORDINATE_SYSTEM = 0xADBE0003
+
+#: The coordinate systems: where x, y and z point, of left or right, down or up, back or front.
+SYSTEMS = (
+    *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
+    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
+)
+
+#: By the axis that points up, the right-handed system whose x points right. None has x pointing up.
+SYSTEM_OF_UP = {"y": "RUB", "-y": "RDF", "z": "RFU", "-z": "RBD"}
+
+#: Names of the other types that are published.
+TYPES = {0xADBE0002: "SPZ_ADOBE_safe_orbit_camera"}
+
+_DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "B": (0, 0, 1), "F": (0, 0, -1)}
+
+#: Bytes of extension records that are read of a file.
+MOST_EXTENSION_BYTES = 1 << 20
+
+#: Kinds of unknown records that are named.
+MOST_NAMED = 8
+
+#: Contents of the extension records of a file: the axis that points up, by the coordinate system; what is left out, as
+#: sentences for `Scene.notes`; and whether there is a coordinate system, be it an unknown one.
+Extensions = tuple[str | None, tuple[str, ...], bool]
+NO_EXTENSIONS: Extensions = (None, (), False)
+
+
+def extensions_of(up: str | None) -> bytes:
+    """Return the extension records of a file in which this axis points up, one of `SYSTEM_OF_UP`; b"" for None."""
+    if up is None:
+        return b""
+    number = SYSTEMS.index(SYSTEM_OF_UP[up]) + 1
+    return RECORD.pack(COORDINATE_SYSTEM, 4) + number.to_bytes(4, "little")
+
+
 def read_extensions(data: bytes, size: int) -> Extensions:
     """Parse extension records; unknown ones are skipped, and broken ones are noted.
 
@@ -396,6 +398,8 @@ def read_extensions(data: bytes, size: int) -> Extensions:
         notes.append(f"the last {size - at:,} bytes of its extensions are no records that can be read")
     return up, tuple(notes), has_system
 
+
+# Writing.
 
 #: The largest code that a coordinate is given, 2 ** 23 - 2. Writers clamp what does not fit to the code after it, of
 #: either sign, so `inspect` takes a coordinate that has that one for clamped.
@@ -576,7 +580,7 @@ class SpzEncoder:
         yield from frames
 
     def keeping(self, stored: StoredCodes, unchanged: NDArray[np.bool_]) -> SpzEncoder:
-        """Return an encoder of as many nodes that gives some the codes of a file, where its coding is the same."""
+        """Return an encoder that gives unchanged nodes their codes of a file, where the coding is the same."""
         (layout, codes), kept = stored, {}
         for stream in self.layout.streams():
             is_alike = stream.column in COLUMNS

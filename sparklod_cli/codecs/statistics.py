@@ -1,4 +1,4 @@
-"""`Statistics`: what is known of all splats of a file before the first of them is written.
+"""`Statistics`: counts over all splats of a file, which settle its options before the first splat is written.
 
 Parts are counted on their own and merged in any order with the same result, which stays small: the settings of a file
 that does not fit into memory follow from the statistics of its parts. `Distribution` also serves `inspect`.
@@ -208,7 +208,7 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """Statistics of splats; those that were not requested are missing.
+    """Statistics of splats; fields that were not requested are missing.
 
     Attributes:
         tree: the splats are nodes of a tree.
