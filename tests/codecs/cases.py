@@ -56,6 +56,11 @@ def stated_degrees(decode: Callable[..., object]) -> float:
     return float(match[1])
 
 
+def half_float(values: Array) -> Array:
+    """Half a step of float16: relative, or that of its smallest numbers."""
+    return np.maximum(2.0**-11 * np.abs(values), 2.0**-25)
+
+
 # --- Splats and trees -------------------------------------------------------------------------------------------------
 
 

@@ -21,7 +21,6 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import FORMATS, HEAD, JSON_HEAD, WRITABLE, Format, ending_of, head_of, sniff
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.reader import FileNote, comment_of, note_of, read_comment, read_note
-from sparklod_cli.io.local_files import read_text
 from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import AXES, Scene
@@ -198,20 +197,6 @@ def test_a_byte_order_mark_makes_no_difference(manifest: str, encoding: str, tmp
         found = read_scene(given)
         assert (found.splats.center == expected.splats.center).all()
         assert found.format == expected.format
-
-
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_texts_of_users_may_have_a_byte_order_mark(encoding: str, tmp_path: Path) -> None:
-    matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
-    path = tmp_path / "transforms.json"
-    path.write_text(json.dumps({"camera_angle_x": 0.7, "frames": [{"transform_matrix": matrix}]}), encoding)
-    assert run(["traverse", str(TREE), "--camera-path", str(path), "-o", str(tmp_path / "t.csv")]) == 0
-    instances = tmp_path / "instances.json"
-    instances.write_text(json.dumps({"instances": [{"file": str(TREE)}]}), encoding)
-    assert read_text(instances).startswith("{")
-    expect = tmp_path / "expect.txt"
-    expect.write_text("bytes<=10", encoding)
-    assert read_text(expect) == "bytes<=10"
 
 
 @pytest.mark.parametrize("manifest", MANIFESTS)

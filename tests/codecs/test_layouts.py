@@ -22,8 +22,6 @@ from sparklod_cli.codecs import array_files, data_texture, ext_splats, packed_sp
 from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.codecs.losses import SAMPLE, LayoutLoss, sample_loss
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
-from sparklod_cli.lod import quick
-from sparklod_cli.model import gaussian
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity, normalized_quat
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
@@ -31,7 +29,7 @@ from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import FormatError
 from sparklod_cli.system.threads import BLOCK_ROWS
-from tests.codecs.cases import assert_same, random_quats, rotation_degrees, splats_with
+from tests.codecs.cases import assert_same, half_float, random_quats, rotation_degrees, splats_with
 from tests.references import gaussians
 from tests.scenes import random_splats
 
@@ -61,10 +59,6 @@ def round_trip(splats: Splats, layout: Layout = DEFAULT) -> Splats:
     return unpack(pack(splats, layout), layout)
 
 
-def links(child_count: Any, child_start: Any) -> LodTree:
-    return LodTree(np.asarray(child_count, np.uint16), np.asarray(child_start, np.uint32))
-
-
 # --- Bytes ------------------------------------------------------------------------------------------------------------
 
 
@@ -82,14 +76,6 @@ def test_a_splat_of_ext_splats_is_eight_words_of_these_bytes() -> None:
     rotation = 512 | 1023 << 10 | 2048 << 20
     assert packed["ext1"].tobytes() == struct.pack("<6eI", 0.5, -0.25, 1.5, 0, -np.inf, -4.5, rotation)
     assert all(array.dtype == np.uint32 and array.shape == (1, 4) for array in packed.values())
-
-
-def test_a_node_is_four_words_of_these_bytes() -> None:
-    splats = splats_with(2, center=[1, -2, 0.5], scale=[0.25, 0.5, 0.75], opacity=[1, linear_opacity(np.float32(3))])
-    packed = spark_nodes.pack(splats, links([65535, 0], [2**32 - 1, 0]))
-    expected = struct.pack("<4eII", 1, -2, 0.5, 1, 65535, 2**32 - 1) + struct.pack("<4eII", 1, -2, 0.5, 2.4, 0, 0)
-    assert packed["lod_tree"].tobytes() == expected
-    assert (list(packed), packed["lod_tree"].dtype, packed["lod_tree"].shape) == (["lod_tree"], np.uint32, (2, 4))
 
 
 def test_words_of_sh_in_packed_splats_are_those_worked_out_by_hand() -> None:
@@ -153,11 +139,6 @@ def exponentials(low: float, high: float) -> np.ndarray:
     values = np.exp(ramp(low, high, 3))
     values[::2] *= -1
     return values
-
-
-def half_float(values: np.ndarray) -> np.ndarray:
-    """Half a step of float16: relative, or that of its smallest numbers."""
-    return np.maximum(2.0**-11 * np.abs(values), 2.0**-25)
 
 
 def log_scale(splats: Splats) -> np.ndarray:
@@ -425,60 +406,6 @@ def test_arrays_of_wrong_shapes_or_types_are_refused(unpack: Callable, words: An
 def test_an_encoding_with_an_empty_range_is_refused(ranges: dict[str, float], text: str) -> None:
     with pytest.raises(ValueError, match=re.escape(text)):
         SplatEncoding(**ranges)
-
-
-# --- Trees ------------------------------------------------------------------------------------------------------------
-
-
-def test_node_sizes_are_those_worked_out_by_hand() -> None:
-    splats = splats_with(3, scale=[0.25, 0.5, 0.75], opacity=[0.3, 1, linear_opacity(np.float32(3))])
-    np.testing.assert_allclose(gaussian.spark_size(splats), [1, 1, 2.4], rtol=1e-6)
-    sizes = spark_nodes.unpack(spark_nodes.pack(splats, links([0, 0, 0], [0, 0, 0]))).size
-    np.testing.assert_array_equal(sizes, np.float16([1, 1, 2.4]))
-
-
-def test_sizes_keep_and_reach_their_error() -> None:
-    size = np.exp(np.linspace(-20, np.log(65504), 100_001)).astype(np.float32)
-    spheres = splats_with(len(size), scale=(size / 2)[:, None], opacity=1)
-    got = spark_nodes.unpack(spark_nodes.pack(spheres, links([0] * size.size, [0] * size.size)))
-    ratio = np.abs(got.size.astype(np.float64) - size) / half_float(size)
-    assert 0.99 <= ratio.max() <= ROUNDING
-    assert ratio[size < 2.0**-14].max() >= 0.99
-
-
-@given(center=arrays(np.float32, (8, 3), elements=st.floats(-65504, 65504, width=32)))
-def test_centres_of_nodes_keep_their_error(center: np.ndarray) -> None:
-    back = spark_nodes.unpack(spark_nodes.pack(splats_with(8, center=center), links([0] * 8, [0] * 8))).center
-    assert (np.abs(back.astype(float) - center) <= half_float(center)).all()
-
-
-@pytest.mark.filterwarnings("error")
-def test_sizes_and_centres_beyond_float16_are_infinite_without_a_warning() -> None:
-    splats = splats_with(1, center=[3e38, -3e38, 65519], scale=3e38, opacity=1000)
-    got = spark_nodes.unpack(spark_nodes.pack(splats, links([0], [0])))
-    assert got.center.tolist() == [[np.inf, -np.inf, 65504]]
-    assert got.size.tolist() == [np.inf]
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_a_whole_tree_comes_back(threads: int) -> None:
-    splats, tree = quick.build(random_splats(BLOCK_ROWS + 1000))
-    packed = spark_nodes.pack(splats, tree, threads=threads)
-    got = spark_nodes.unpack(packed)
-    np.testing.assert_array_equal(got.tree.child_count, tree.child_count)
-    np.testing.assert_array_equal(got.tree.child_start, tree.child_start)
-    np.testing.assert_array_equal(got.center, splats.center.astype(np.float16))
-    np.testing.assert_array_equal(got.size, gaussian.spark_size(splats).astype(np.float16))
-    packed["lod_tree"][:] = 0
-    got.tree.validate()  # a copy
-
-
-def test_trees_of_no_nodes_are_empty_arrays_and_others_need_as_many_nodes_as_splats() -> None:
-    packed = spark_nodes.pack(Splats.empty(0, 0), links([], []))
-    assert packed["lod_tree"].shape == (0, 4)
-    assert len(spark_nodes.unpack(packed).tree) == 0
-    with pytest.raises(FormatError, match="2 nodes, but 3 splats"):
-        spark_nodes.pack(random_splats(3), links([0, 0], [0, 0]))
 
 
 # --- The data texture, against a twin that follows the viewer splat by splat ------------------------------------------

@@ -1,22 +1,32 @@
-"""Nodes as Spark has them: nearly those of unpacked words, whose last bits alone differ; with Spark's own arithmetic.
+"""Nodes as Spark has them: the layout of its traversal, and nodes measured after Spark's coding, in its own arithmetic.
 
 `tests/interop/test_loaded_nodes.py` holds them to Spark, bit for bit.
 """
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from sparklod_cli.codecs import ext_splats, packed_splats, quantize, spark_codings, spark_nodes
 from sparklod_cli.codecs.formats import LOADED
 from sparklod_cli.codecs.spark_codings import SplatEncoding, log_scale_table
 from sparklod_cli.lod import quick
+from sparklod_cli.model import gaussian
+from sparklod_cli.model.gaussian import linear_opacity
 from sparklod_cli.model.lod_tree import LodTree, Nodes
 from sparklod_cli.model.scene import PLAIN_SCALES, SPZ_SCALES, FileCoding, ScaleCoding, Scene
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.system.errors import FormatError
+from sparklod_cli.system.threads import BLOCK_ROWS
+from tests.codecs.cases import half_float, splats_with
 from tests.scenes import random_splats
 
 SPZ = FileCoding((SPZ_SCALES,))
@@ -100,3 +110,69 @@ def test_runs_of_splats_have_codings_of_their_own(scene: Scene) -> None:
 def test_an_empty_tree_has_no_nodes(layout: str) -> None:
     empty = Scene(Splats.empty(0, 0), LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
     assert len(nodes(empty, layout, SPZ).size) == 0
+
+
+# --- The layout of Spark's traversal ----------------------------------------------------------------------------------
+
+
+def links(child_count: Any, child_start: Any) -> LodTree:
+    return LodTree(np.asarray(child_count, np.uint16), np.asarray(child_start, np.uint32))
+
+
+def test_a_node_is_four_words_of_these_bytes() -> None:
+    splats = splats_with(2, center=[1, -2, 0.5], scale=[0.25, 0.5, 0.75], opacity=[1, linear_opacity(np.float32(3))])
+    packed = spark_nodes.pack(splats, links([65535, 0], [2**32 - 1, 0]))
+    expected = struct.pack("<4eII", 1, -2, 0.5, 1, 65535, 2**32 - 1) + struct.pack("<4eII", 1, -2, 0.5, 2.4, 0, 0)
+    assert packed["lod_tree"].tobytes() == expected
+    assert (list(packed), packed["lod_tree"].dtype, packed["lod_tree"].shape) == (["lod_tree"], np.uint32, (2, 4))
+
+
+def test_node_sizes_are_those_worked_out_by_hand() -> None:
+    splats = splats_with(3, scale=[0.25, 0.5, 0.75], opacity=[0.3, 1, linear_opacity(np.float32(3))])
+    np.testing.assert_allclose(gaussian.spark_size(splats), [1, 1, 2.4], rtol=1e-6)
+    sizes = spark_nodes.unpack(spark_nodes.pack(splats, links([0, 0, 0], [0, 0, 0]))).size
+    np.testing.assert_array_equal(sizes, np.float16([1, 1, 2.4]))
+
+
+def test_sizes_keep_and_reach_their_error() -> None:
+    size = np.exp(np.linspace(-20, np.log(65504), 100_001)).astype(np.float32)
+    spheres = splats_with(len(size), scale=(size / 2)[:, None], opacity=1)
+    got = spark_nodes.unpack(spark_nodes.pack(spheres, links([0] * size.size, [0] * size.size)))
+    ratio = np.abs(got.size.astype(np.float64) - size) / half_float(size)
+    assert 0.99 <= ratio.max() <= 1.001
+    assert ratio[size < 2.0**-14].max() >= 0.99
+
+
+@given(center=arrays(np.float32, (8, 3), elements=st.floats(-65504, 65504, width=32)))
+def test_centres_of_nodes_keep_their_error(center: np.ndarray) -> None:
+    back = spark_nodes.unpack(spark_nodes.pack(splats_with(8, center=center), links([0] * 8, [0] * 8))).center
+    assert (np.abs(back.astype(float) - center) <= half_float(center)).all()
+
+
+@pytest.mark.filterwarnings("error")
+def test_sizes_and_centres_beyond_float16_are_infinite_without_a_warning() -> None:
+    splats = splats_with(1, center=[3e38, -3e38, 65519], scale=3e38, opacity=1000)
+    got = spark_nodes.unpack(spark_nodes.pack(splats, links([0], [0])))
+    assert got.center.tolist() == [[np.inf, -np.inf, 65504]]
+    assert got.size.tolist() == [np.inf]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_whole_tree_comes_back(threads: int) -> None:
+    splats, tree = quick.build(random_splats(BLOCK_ROWS + 1000))
+    packed = spark_nodes.pack(splats, tree, threads=threads)
+    got = spark_nodes.unpack(packed)
+    np.testing.assert_array_equal(got.tree.child_count, tree.child_count)
+    np.testing.assert_array_equal(got.tree.child_start, tree.child_start)
+    np.testing.assert_array_equal(got.center, splats.center.astype(np.float16))
+    np.testing.assert_array_equal(got.size, gaussian.spark_size(splats).astype(np.float16))
+    packed["lod_tree"][:] = 0
+    got.tree.validate()  # a copy
+
+
+def test_trees_of_no_nodes_are_empty_arrays_and_others_need_as_many_nodes_as_splats() -> None:
+    packed = spark_nodes.pack(Splats.empty(0, 0), links([], []))
+    assert packed["lod_tree"].shape == (0, 4)
+    assert len(spark_nodes.unpack(packed).tree) == 0
+    with pytest.raises(FormatError, match="2 nodes, but 3 splats"):
+        spark_nodes.pack(random_splats(3), links([0, 0], [0, 0]))
