@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import clamps, sh_palette, spz
+from sparklod_cli.codecs import losses, sh_palette, spz
 from sparklod_cli.codecs import encoder as encoder_module
 from sparklod_cli.codecs.options import DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
@@ -60,8 +60,8 @@ def test_windows_are_encoded_anywhere_and_count_what_they_clamp(
     pieces = pickle.loads(sent).pieces(lambda number, name: found[number][name], threads=1, progress=silent)
     assert b"".join(pieces) == encode(codec, scene, PALETTE, threads=2)
     tallies = [found[number][encoder_module.CLAMPED] for number in sorted(found)]
-    expected = clamps.clamps_in(scene.splats, ranges=ranges, tree=scene.tree)
-    assert clamps.clamps_of(tallies, ranges) == expected
+    expected = losses.clamps_in(scene.splats, ranges=ranges, tree=scene.tree)
+    assert losses.clamps_of(tallies, ranges) == expected
     assert not sh_degree or set(expected[0]) >= {"sh"}
 
 
