@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.codecs import losses, sh_palette, spz
 from sparklod_cli.codecs import encoder as encoder_module
+from sparklod_cli.codecs import losses, sh_palette, spz
 from sparklod_cli.codecs.options import DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.reader import OpenFile
