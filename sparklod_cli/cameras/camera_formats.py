@@ -37,9 +37,9 @@ class PathFormat(NamedTuple):
         name: value of `--camera-format`.
         module: in this package; has `recognises_NAME(files) -> bool` and `parse_NAME(files, settings) -> Parsed`.
         axes: of its matrices; None if it has eyes and targets instead.
-        looking: its cameras have, or may have, an eye and a target, which need an up axis.
+        looking: its cameras may have an eye and a target instead of a matrix, and then need an up axis.
         world: note for a path without `--world-transform`: the world of its cameras may not be that of the splats.
-        names: sets of names of files that belong together in a folder; empty if its file may have any name.
+        names: sets of file names that belong together in a folder; empty if its file may have any name.
     """
 
     name: str

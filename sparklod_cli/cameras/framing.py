@@ -15,8 +15,8 @@ from ..model.splats import Splats
 from ..system.errors import InvalidSplatsError
 from .camera import Camera, Matrix
 
-#: Standard deviations out to which an opaque splat counts. There an opacity of an eighth is left, exp(-2); fainter
-#: splats count out to where as much is left of them.
+#: Radius of the bounding sphere of an opaque splat, standard deviations: its opacity there is exp(-2). The sphere of a
+#: fainter splat ends where it has the same opacity.
 SEEN = 2.0
 
 #: Columns of `Splats` that `balls_of` reads.
@@ -61,8 +61,8 @@ class Balls:
     Attributes:
         center: (N, 3) float64 world units.
         radius: (N,) float64 world units.
-        box: (2, 3) lowest and highest coordinates of all centres, where these are a sample; None where they are all.
-        largest: radius, where these are a sample.
+        box: (2, 3) lowest and highest coordinates of all centres, if the N spheres are a sample; else None.
+        largest: largest radius of all, if the N spheres are a sample; else None.
     """
 
     center: Matrix
@@ -78,7 +78,7 @@ class Balls:
 
 
 def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matrix) -> Balls:
-    """Return what some splats of an object cover in the world; those without finite numbers are left out."""
+    """Return the bounding spheres, in the world, of the splats of an object that have finite numbers."""
     with np.errstate(all="ignore"):
         center = splats.center[index].astype(np.float64) @ object_to_world[:3, :3].T + object_to_world[:3, 3]
         times = float(np.cbrt(np.linalg.det(object_to_world[:3, :3])))

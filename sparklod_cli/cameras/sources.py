@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 #: x, y and z in world units.
 Point = tuple[float, ...]
 
-#: Gives what the splats cover; called only by sources that are chosen for the scene.
+#: Returns the bounding spheres of the splats; called only where a camera is placed by the scene.
 Scene = Callable[[], "Balls"]
 
 #: Most that a camera turns from one frame of a movement to the next, degrees: a quarter of the default field of view.

@@ -209,7 +209,7 @@ class Panel:
     Attributes:
         columns: that the chart needs; without a number in each of them it is left out.
         draw: draws into matplotlib's axes and returns (N,) heights at which frames are marked.
-        marks: reasons for marking a frame in this chart.
+        marks: criteria by which frames are marked in this chart.
     """
 
     title: str
@@ -358,7 +358,7 @@ PANELS = (
 )
 
 
-#: Labels of the reasons for marking a frame (`simulation.results.MOMENTS`).
+#: Labels of the criteria by which frames are marked (`simulation.results.MOMENTS`).
 CALLED = {
     "churn": "most churn",
     "bytes": "most bytes fetched",
@@ -376,7 +376,7 @@ def plot(
 
     Args:
         rows: of all frames, at least one; those of single instances are left out.
-        marked: numbers of notable frames, by the reason, a key of `CALLED`.
+        marked: numbers of notable frames by criterion, a key of `CALLED`.
     """
     frames = totals(rows)
     if not frames:
@@ -419,7 +419,7 @@ def _one_line(text: str) -> str:
 def draw_charts(rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.uint8]:
     """(H, WIDTH, 3) the charts of a path, of at least one frame; a column without a number has none.
 
-    `marked` are numbers of notable frames, by the reason (`Panel.marks`).
+    `marked` are numbers of notable frames by criterion (`Panel.marks`).
     """
     frames = FrameColumns(rows)
     panels = [panel for panel in PANELS if frames.has(*panel.columns)]
@@ -486,8 +486,8 @@ class PathScene:
     Attributes:
         splats: N splats of the cut of one frame.
         depth: (N,) edges from the root to each node of the cut, or the detail level of each splat.
-        frame: index of the camera whose cut it is; that camera is marked. None for none.
-        title: which of both the depths are, for display.
+        frame: index of the camera whose cut is drawn, and which is marked; None for no mark.
+        title: name of `depth`, for display.
     """
 
     cameras: Sequence[Camera]

@@ -41,8 +41,8 @@ class Coloring:
         title: the quantity, for display.
         ramp: (S, 3) uint8 colours of the scale, from its low to its high end; few and distinct for whole numbers.
         marks: positions on the scale, 0..1, and their labels.
-        low, high: numbers of the first colour and of the last; those beyond have these, too.
-        log: they are powers of ten.
+        low, high: numbers of the first and of the last colour; numbers beyond have the same colours.
+        log: `low` and `high` are decimal logarithms.
     """
 
     title: str
@@ -84,7 +84,7 @@ def whole_numbers(title: str, low: int, high: int, *, least: int | None = None, 
 
 
 def depth_scale(title: str, values: NDArray[Any]) -> Coloring:
-    """Return the scale of some whole numbers: few of them at either end take no colours from the others."""
+    """Return the scale of whole numbers, without outliers at either end."""
     least, most = int(values.min()), int(values.max())
     low, high = np.percentile(values, [CLIPPED, 100 - CLIPPED]) if most - least > 1 else (least, most)
     return whole_numbers(title, int(low), int(high), least=least, most=most)
@@ -150,15 +150,15 @@ def ticks(low: float, high: float, least: float) -> list[tuple[float, str]]:
 #: Sample sizes, splats and cameras, to find the ends of a scale.
 SAMPLE, CAMERAS = 1 << 18, 64
 
-#: The most cuts that are found for it, which takes longer.
+#: Most cameras whose cuts are computed to find the ends of a scale.
 CUTS = 16
 
-#: Marks nearer to an end of a scale than this would touch its own.
+#: Least distance of a mark from the ends of a scale, as a share of it; nearer marks would touch those of the ends.
 APART = 0.05
 
 
 def values_of(by: str, part: Part) -> FloatArray:
-    """Return (M,) the numbers that some splats are coloured by: "level", "lod-opacity", "size" or "chunk".
+    """Return (M,) values of a quantity of splats: "level", "lod-opacity", "size" or "chunk".
 
     A level is a depth in a tree, or a detail level. Sizes are in world units; splats of files without either are of
     level 0.
@@ -171,7 +171,7 @@ def values_of(by: str, part: Part) -> FloatArray:
 
 
 def scale_of_splats(by: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress = silent) -> Coloring:
-    """Return the scale of a quantity of `values_of`, for all splats that cameras may see; of whole numbers, do see.
+    """Return the scale of a quantity of `values_of`: of whole numbers in the cuts of cameras, of others in all splats.
 
     `SparklodError` by level, where no file has any.
     """
@@ -191,7 +191,7 @@ def scale_of_splats(by: str, source: CutFinder, cameras: Sequence[Camera], progr
 
 
 def scale_of_depth(source: CutFinder, cameras: Sequence[Camera], settings: RasterSettings) -> Coloring:
-    """Return the scale from the nearest splats to the farthest that cameras see, but for a few."""
+    """Return the scale of the depths of the splats that cameras see, without outliers."""
     parts = source.candidates().parts
     every = max(1, sum(len(part.index) for part in parts) // SAMPLE)
     centers = np.concatenate([moved(part.splats.center[::every], part.object_to_world) for part in parts])
@@ -212,13 +212,13 @@ def scale_of_depth(source: CutFinder, cameras: Sequence[Camera], settings: Raste
 
 
 def scale_of_overdraw(counts: Sequence[FloatArray]) -> Coloring:
-    """Return the scale from none to the most that all but a few pixels of some pictures have."""
+    """Return the scale from 0 to the overdraw of nearly all pixels of some pictures."""
     most = max(float(np.percentile(count, 99.9)) for count in counts)
     return linear("overdraw", MAGMA, 0.0, max(1.0, float(math.ceil(most))), APART)
 
 
 def _whole(by: str, title: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress) -> Coloring:
-    """Return the scale from the least to the most that some cameras see; others may see less, or more."""
+    """Return the scale from the least to the largest number in the cuts of a sample of the cameras."""
     every = -(-len(cameras) // CUTS)
     some = cameras[::every]
     ends = []

@@ -359,7 +359,7 @@ _CONSTANTS = _glsl_constants(
     MAX_VARIANCE=float(MAX_VARIANCE),
 )
 
-#: Gets a splat out of the texels of `Floats`, and its covariance on the screen.
+#: GLSL that reads a splat from the texels of `Floats`, and computes its covariance on the screen.
 _FLOATS = """
 const int TEXELS = 4, ROW_BITS = 11;
 

@@ -24,8 +24,7 @@ from .render_settings import CLIP, RasterSettings, RenderSettings, uses_card
 if TYPE_CHECKING:
     from .color_scales import Coloring
 
-#: The device that draws instead of the backend numba where a card is used, and modules of all that draw: each has a
-#: function `draw`.
+#: Name of the backend numba on a card, and modules of the backends; each has a function `draw`.
 ON_CARD = "cuda"
 MODULES = {
     "numba": ".rasterizer",
@@ -34,7 +33,7 @@ MODULES = {
     "open3d": ".open3d_backend",
 }
 
-#: Held while kernels run on all threads: they do not share them, and not every layer of threads survives their trying.
+#: Held while kernels run: each uses all threads, and some threading layers of numba crash when called concurrently.
 _KERNELS = threading.Lock()
 
 
@@ -135,7 +134,7 @@ class Renderer:
 
 
 def colored_by_depth(splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> tuple[ShadedSplats, float]:
-    """Return splats with grays of their depths over the largest depth, as backends draw colours of 0..1; and that."""
+    """Return splats in grays of their depths divided by the largest visible depth, and that depth, world units."""
     depth = (splats.center - camera.position.astype(np.float32)) @ camera.forward.astype(np.float32)
     top = float(depth[(depth > raster.near) & (depth < raster.far)].max(initial=raster.near))
     gray = np.clip(np.nan_to_num(depth) / np.float32(top), 0, 1)

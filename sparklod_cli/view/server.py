@@ -37,7 +37,7 @@ IDLE = 60
 #: Headers of every answer.
 ALWAYS = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "Cache-Control": "no-cache"}
 
-#: Headers of an answer that pages of other origins may read, and of one that they may not even embed.
+#: Headers of an answer that pages of other origins may read, and of one that they may neither read nor embed.
 SHARED = {
     "Access-Control-Allow-Origin": "*",
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
@@ -45,7 +45,7 @@ SHARED = {
 }
 PRIVATE = {"Cross-Origin-Resource-Policy": "same-origin"}
 
-#: What a page of another origin may send, with --cors.
+#: Headers of the answer to a preflight request, with --cors.
 PREFLIGHT = {
     "Access-Control-Allow-Methods": "GET, HEAD",
     "Access-Control-Allow-Headers": "Range, If-Range",
@@ -55,10 +55,10 @@ PREFLIGHT = {
 #: A Range header (RFC 9110, section 14) of one range: from a first byte to a last one, from a first on, or the last.
 RANGE = re.compile(r"bytes\s*=\s*([0-9]*)\s*-\s*([0-9]*)\s*", re.IGNORECASE | re.ASCII)
 
-#: Digits of a number of bytes in a request; any number of more digits is beyond every file.
+#: Most digits of a number of bytes in a request; a longer number exceeds the size of any file.
 DIGITS = 18
 
-#: Says one line about a request.
+#: Receives one line about each request.
 Log = Callable[[str], None]
 
 

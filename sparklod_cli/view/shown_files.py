@@ -54,10 +54,10 @@ SPARK_TYPES = {
     "RAD": "rad",
 }
 
-#: Engines of the other formats, except formats that no engine shows.
+#: Engines of formats that Spark does not read.
 OTHER_ENGINES = {"Streamed SOG": "playcanvas", "GLB": "playcanvas", "3D Tiles": "cesium"}
 
-#: Beginnings of files that sparklod reads and Spark 2.2.0 does not, and names of their formats.
+#: Patterns of the beginnings of files that sparklod reads and Spark 2.2.0 does not, with names of their formats.
 UNREAD = (
     (rb"NGSP", "SPZ version 4"),
     (rb"ply\s+((comment|obj_info)\b.*\s+)*format\s+(?!binary_little)", "PLY that is ascii or big-endian"),
@@ -78,10 +78,10 @@ MEDIA_TYPES = {
 }
 BYTES = "application/octet-stream"
 
-#: Suffixes of the files that a splat file may name.
+#: Suffixes of the files that a splat file may refer to.
 PARTS = (".json", ".sog", ".webp", ".glb", ".gltf", ".bin", ".radc", ".rad")
 
-#: By name, with / between folders: bytes, or the real path of a file.
+#: Resources of a site by name, with / between folders: bytes, or the real path of a file.
 Resources = Mapping[str, bytes | Path]
 
 
@@ -93,7 +93,7 @@ class ShownFile:
         url: relative to the page.
         format: for display: "RAD", "SPZ".
         spark_type: Spark's name of its format; None if another engine shows it.
-        files: itself and its companions, by the names under which they are served.
+        files: paths of the file and its companions, by the names under which they are served.
         note: why Spark will not show it; None if no reason is known.
     """
 
@@ -255,10 +255,10 @@ Point = tuple[float, float, float]
 #: Vertical field of view where none is given, degrees.
 FOV = round(math.degrees(DEFAULT_FOV_Y), 9)
 
-#: The feature sizes that colours distinguish, as percentiles of all: of trees, few nodes are coarse.
+#: Percentiles of feature sizes between which colours differ; few nodes of a tree are coarse.
 SIZES = 1, 99.9
 
-#: How many times smaller the splats of a large RAD tree are than those of its first chunk: some levels.
+#: Assumed ratio of the smallest splats in the first chunk of a large RAD tree to the smallest of the tree.
 BELOW = 8
 
 
@@ -267,13 +267,13 @@ class Extent:
     """Extent of a splat file, for the first view.
 
     Attributes:
-        splats: how many, nodes where it is a tree.
-        leaves: how many of a tree, or splats of full detail where there are levels; None without either.
-        balls: what its splats cover; only the coarsest of a large RAD tree.
-        sizes: (2,) the range of the feature sizes of its splats, but for a few at either end, world units.
+        splats: number of splats, or of nodes of a tree.
+        leaves: number of leaves of a tree, or of splats at full detail of a file with levels; None without either.
+        balls: bounding spheres of its splats; of a large RAD tree, of the coarsest only.
+        sizes: (2,) range of the feature sizes of its splats without outliers, world units.
         up, up_by: as in `Scene`.
-        levels: detail levels; None without.
-        layout: in which Spark is to hold the splats, "ext" or "packed".
+        levels: number of detail levels; None for a file without.
+        layout: layout of the splats in Spark's memory, "ext" or "packed".
     """
 
     splats: int
@@ -378,7 +378,7 @@ def _parts_extent(scene: DetailScene | TileScene) -> Extent:
 
 
 def _sizes(splats: Splats) -> tuple[float, float]:
-    """Return the range of the feature sizes of some splats, as if none had a D above 1; both ends are above 0."""
+    """Return the range of the feature sizes of splats, with opacity taken as at most 1; both ends are above 0."""
     sizes = 2 * splats.scale[:: max(len(splats) // framing.SAMPLE, 1)].mean(axis=1, dtype=np.float64)
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
     if not len(sizes):
@@ -390,7 +390,7 @@ def _sizes(splats: Splats) -> tuple[float, float]:
 def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Point, fov: float) -> Start:
     """Return the first view of some files together; `CameraPathError` if the camera makes no sense.
 
-    `view` has eye and target, where they are given; else the whole scene is in view, from its front.
+    `view` is an eye and a target; None for the whole scene from its front.
     """
     balls = Balls.concat(extent.balls for extent in extents)
     settings = Settings(size=DEFAULT_SIZE, fov_y=math.radians(fov), up=up)

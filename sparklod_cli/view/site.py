@@ -36,17 +36,17 @@ from .shown_files import ENGINES, Extent, Resources, ShownFile, Start
 
 SPARK, PLAYCANVAS, CESIUM, THREE = "@sparkjsdev/spark", "playcanvas", "cesium", "three"
 
-#: What each engine of `files.ENGINES` needs; the page has its vectors from three.js, whatever draws.
+#: npm packages of each engine of `shown_files.ENGINES`; the page itself uses the vectors of three.js.
 PACKAGES = {"spark": (SPARK, THREE), "playcanvas": (PLAYCANVAS, THREE), "cesium": (CESIUM, THREE)}
 
 #: The versions that the page was tested with.
 VERSIONS = {SPARK: "2.2.0", PLAYCANVAS: "2.23.3", CESIUM: "1.145.0", THREE: "0.187.0"}
 
-#: Serves the files of npm packages as they were published.
+#: A CDN of npm packages, with the files of each as published.
 CDN = "https://cdn.jsdelivr.net/npm"
 
-#: The modules by package and path in it, with the SHA-384 of those of `VERSIONS`: a browser refuses a module of the CDN
-#: that has another one. Spark imports one module of three's examples, three's first module imports its core.
+#: Modules by package and path, with their SHA-384 in the `VERSIONS`; a browser refuses a module of the CDN with another
+#: digest. Spark imports one module of the examples of three.js, whose main module imports its core.
 MODULES = {
     (SPARK, "dist/spark.module.js"): "OQEdbh3DPqIT6IsNEl9DQBNeBw4p2sTknDP1lrT6MjlQoTIEtzzM5LZ4ljB1QCh3",
     (PLAYCANVAS, "build/playcanvas.min.mjs"): "jIMtMpSIHxCHjnqekLLvZ9pz0cGMfA5JXdcO5YcNe5+Kn2IgCATDYJK4MjQVpxS+",
@@ -55,8 +55,8 @@ MODULES = {
     (THREE, "examples/jsm/postprocessing/Pass.js"): "927X5fcqlqKPsXZV1w3tv5BZx797OXX3D/TDJk0FHwJd12z58B5aqS77g5LZoprI",
 }
 
-#: What else an engine loads, as patterns of paths in its package: workers of CesiumJS that pack and sort splats, whose
-#: names of other modules change from version to version; and what every scene of it reads.
+#: Patterns of the other files that a package loads: workers of CesiumJS that pack and sort splats, their chunks, whose
+#: names change from version to version, and files that each of its scenes reads.
 FILES = {
     CESIUM: (
         "Build/Cesium/index.js",
@@ -69,11 +69,11 @@ FILES = {
     )
 }
 
-#: Packages that need a page which may evaluate text and hold styles: CesiumJS, in which Knockout looks for `this` so,
-#: and which writes the styles of its credits into the page.
+#: Packages whose page must allow `eval` and inline styles: CesiumJS, as its Knockout evaluates text to find the global
+#: object, and its credits have inline styles.
 LENIENT = {CESIUM}
 
-#: What the page and Spark call modules, and what those names begin or are.
+#: Import map of the page: module names, or their beginnings, with package and path.
 MODULE_NAMES = {
     SPARK: (SPARK, "dist/spark.module.js"),
     PLAYCANVAS: (PLAYCANVAS, "build/playcanvas.min.mjs"),
@@ -82,7 +82,7 @@ MODULE_NAMES = {
     "three/addons/": (THREE, "examples/jsm/"),
 }
 
-#: Accompany the modules, as the licenses of all packages ask for: a package has one of these.
+#: File names of licenses, one of which each package has; it is served beside the modules, as the licenses require.
 LICENSES = ("LICENSE", "LICENSE.md")
 
 
@@ -93,9 +93,9 @@ class Libraries:
     Attributes:
         versions: by package.
         source: for display: the address of the CDN, or the folder.
-        base: of the addresses of all packages, absolute or relative to the page.
-        integrity: of the modules, by address; empty where the site itself has them.
-        files: that the site itself has, by the names that they are served under.
+        base: beginning of the addresses of all packages, absolute or relative to the page.
+        integrity: digests of the modules, by address; empty where the site itself serves them.
+        files: those that the site itself serves, by name.
     """
 
     versions: Mapping[str, str]
@@ -186,10 +186,10 @@ def _version(package: Path) -> str:
 #: Bytes of a request with camera files, in base64: COLMAP's images.txt of a large scene has 50 MB.
 MAX_BYTES = 1 << 27
 
-#: Files that are dropped together; COLMAP's models have three.
+#: Most files dropped together; COLMAP's models have three.
 MAX_FILES = 16
 
-#: Cameras that the page gets; of longer paths only so many, evenly spaced.
+#: Most cameras of a path sent to the page; of a longer path, an even sample.
 MAX_CAMERAS = 20_000
 
 
@@ -198,7 +198,7 @@ def parse_drop(body: bytes, settings: CameraSettings) -> dict[str, Any]:
 
     Args:
         body: JSON, {"files": [{"name": text, "data": base64}]}.
-        settings: of the cameras; `up` is left out of those of files whose cameras have up axes of their own.
+        settings: settings of the cameras; `up` is ignored for files whose cameras have up axes of their own.
     """
     contents = _contents(body)
     first = next((names[0] for names in NAMES if names[0] in contents), next(iter(contents)))
@@ -253,16 +253,16 @@ PAGE = (
     "style.css",
 )
 
-#: What the page reads first, by which `export` also knows its own sites.
+#: Settings of the page; `export` recognizes its own sites by this file.
 SETTINGS = "view.json"
 
-#: Where a server parses camera paths that are dropped onto the page.
+#: Path to which the page posts dropped camera paths.
 CAMERAS = "cameras"
 
-#: Places of the template that are filled.
+#: Placeholders of the template.
 MARK = re.compile(r"\{\{([A-Z_]+)\}\}")
 
-#: What marks `SETTINGS`.
+#: Value of "generator" in `SETTINGS`.
 GENERATOR = "sparklod view"
 
 
@@ -366,22 +366,21 @@ def _index(template: str, title: str, libraries: Libraries) -> str:
     return MARK.sub(lambda found: marks[found[1]], template)
 
 
-#: Names of folders that are incomplete, or about to be removed.
+#: Name of an incomplete folder, or of one about to be removed.
 PARTS = ".sparklod-{}.part"
 
-#: Bytes that are copied at a time.
+#: Bytes copied at a time.
 PIECE = 1 << 20
 
-#: What the folder of a site has: folders, and suffixes of files. Names of files may change from version to version.
+#: Folders, and suffixes of files, in the folder of a site; names of files may change from version to version.
 FOLDERS, SUFFIXES = ("data", "lib"), (".html", ".css", ".js", ".json")
 
 
 def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> None:
     """Raise an `OutputError` where a site cannot be written into a folder.
 
-    A folder that exists is replaced only if it is empty or a site that was exported before: what else somebody keeps in
-    a folder, such as the .git of the pages that it is published from, is not ours to remove. Files of the site must lie
-    elsewhere.
+    An existing folder is replaced only if it is empty or holds an exported site and nothing else: other files in it,
+    such as the .git of published pages, belong to the user. Files that the site shows must lie outside the folder.
     """
     try:
         if folder.suffix.lower() in (".html", ".htm") and not folder.is_dir():

@@ -354,14 +354,6 @@ def test_a_path_passes_its_keyframes_without_jumps() -> None:
     assert max(fovs) == pytest.approx(math.radians(80)), "no overshooting"
 
 
-def test_keyframes_with_times_are_passed_in_time() -> None:
-    keys = [Key((float(t), 0.0, 0.0), (0.0, 0.0, 99.0), time=10 + t) for t in (0, 1, 3, 4)]
-    frames = moved(keys, 4, DEFAULT_UP)
-    assert len(frames) == 17
-    assert np.allclose(positions(frames)[:, 0], np.arange(17) / 4), "equally fast all along"
-    assert [frame.time for frame in frames] == pytest.approx(np.arange(17) / 4)
-
-
 def test_keyframes_in_one_place_turn_the_camera() -> None:
     keys = [Key((0.0, 0.0, 0.0), (math.sin(a), 0.0, math.cos(a))) for a in (0, 1, 1.5)]
     frames = moved(keys, 30, DEFAULT_UP)

@@ -26,13 +26,12 @@ from sparklod_cli.images.sequence import PictureSettings, WrittenPictures, write
 from sparklod_cli.model.instances import instances_of
 from sparklod_cli.render.color_scales import VIRIDIS, smooth
 from sparklod_cli.render.render_settings import RenderSettings
-from sparklod_cli.render.renderer import DrawnPicture, Renderer, averaged, finer
+from sparklod_cli.render.renderer import DrawnPicture, Renderer, averaged
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.packages import install_hint
 from sparklod_cli.viewers.scenes import CutFinder, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.conftest import FIXTURES
-from tests.render.drawables import camera
 
 UNIT = st.floats(0, 1, width=32)
 COLORS = st.tuples(UNIT, UNIT, UNIT)
@@ -87,15 +86,6 @@ def test_supersampling_takes_the_mean_of_squares(times: int) -> None:
             assert np.allclose(coarse[row, column], square.mean(axis=(0, 1)), atol=1e-6)
 
 
-def test_a_finer_camera_sees_the_same() -> None:
-    coarse = camera()
-    fine = finer(coarse, 3)
-    assert (fine.width, fine.height) == (3 * coarse.width, 3 * coarse.height)
-    assert fine.fov_x == pytest.approx(coarse.fov_x)
-    assert fine.fov_y == pytest.approx(coarse.fov_y)
-    assert finer(coarse, 1) is coarse
-
-
 @given(images(), images(), st.floats(0.5, 100))
 def test_a_difference_is_absolute_and_clipped(a: np.ndarray, b: np.ndarray, gain: float) -> None:
     a, b = (pixels.over(image, (0, 0, 0)) for image in (a, b))
@@ -112,13 +102,6 @@ def test_files_hold_every_pixel(form: str, channels: int) -> None:
     with Image.open(io.BytesIO(pixels.encode(codes, form))) as picture:
         assert picture.format == form.upper()
         assert np.array_equal(np.asarray(picture), codes)
-
-
-def test_a_picture_of_floats_is_kept_to_the_bit() -> None:
-    image = np.random.default_rng(2).random((4, 5, 4)).astype(np.float32)
-    again = np.load(io.BytesIO(pixels.encode_floats(image)))
-    assert again.dtype == np.float32
-    assert np.array_equal(again, image)
 
 
 @pytest.mark.parametrize("channels", [3, 4])

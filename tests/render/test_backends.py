@@ -19,7 +19,6 @@ import pytest
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera, look_at
-from sparklod_cli.codecs import data_texture
 from sparklod_cli.images.pyvista_scene import load_pyvista
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.falloff import MIN_ALPHA
@@ -33,7 +32,6 @@ from sparklod_cli.system.packages import install_hint
 from tests.conftest import FIXTURES, ROOT
 from tests.render.drawables import balls, joined, one, psnr, rows, shown
 from tests.render.drawables import camera as plain_camera
-from tests.scenes import random_splats
 
 pytestmark = pytest.mark.slow
 
@@ -245,19 +243,6 @@ def test_keys_are_sorted_upwards_and_equal_ones_backwards() -> None:
     for few in ([], [3.0], [2.0, 2.0], [-0.0, 0.0]):
         for sort in osmesa.SORT.values():
             assert sort(np.array(few, np.float32)).tolist() == list(range(len(few)))[::-1]
-
-
-def test_half_precision_has_the_texture_of_the_viewer() -> None:
-    splats = random_splats(1500)
-    words = osmesa.DATA_TEXTURES["half"]()
-    shaded = shade([(splats, np.eye(4))], CAMERAS["front"])
-    assert words.update(shaded) == (True, True)
-    theirs = data_texture.pack(splats)["texture"]
-    assert words.texture.shape == theirs.shape == (2, 2048, 4)
-    used = np.ones((2, 2048, 4), bool)
-    used[:, ::2, 3] = False  # the word that the viewer does not read
-    assert np.array_equal(words.texture[used], theirs[used])
-    assert words.update(shaded) == (False, False)
 
 
 @needs_opengl

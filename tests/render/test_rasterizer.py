@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render import rasterizer
-from sparklod_cli.render.kernels.project import GROUP, HALF_HEIGHT, HALF_WIDTH, LEAST, TILE, X, Y, exponent, index_of
-from sparklod_cli.render.kernels.raster import BLOCKS, LANES, measure
+from sparklod_cli.render.kernels.project import GROUP, index_of
 from sparklod_cli.render.rasterizer import (
     Image,
     ShadedSplats,
@@ -123,19 +122,6 @@ def test_no_splat_is_larger_than_512_pixels(thin: float, most: float) -> None:
     assert (image[:, :30, 3] == 0).any() and image[..., 3].max() > 0
 
 
-def test_the_edge_of_a_huge_splat_is_512_pixels_from_its_centre() -> None:
-    camera = camera_at((0, 0, 5), size=(1201, 9), focal=(1000.0, 1000.0))
-    image = draw(one((0, 0, 0), 4.0, 1.0, (1, 1, 1)), camera, RasterSettings())
-    [seen] = np.nonzero(image[4, :, 3])
-    assert 511 <= 600 - seen.min() <= 512 and 511 <= seen.max() - 600 <= 512
-
-
-def test_an_lod_opacity_above_five_is_five() -> None:
-    camera = camera_at()
-    five, more = (draw(one((0, 0, 0), 0.3, d, (1, 0.5, 0)), camera, RasterSettings()) for d in (5.0, 7.5))
-    np.testing.assert_array_equal(five, more)
-
-
 @pytest.mark.parametrize("sh_degree", range(4))
 def test_colours_follow_the_direction_by_spherical_harmonics(sh_degree: int) -> None:
     splats = random_splats(200, sh_degree=sh_degree)
@@ -157,13 +143,6 @@ def test_moving_splats_is_moving_the_camera_the_other_way(size: float) -> None:
     plain = draw(shade([(splats, np.eye(4))], camera), camera, RasterSettings())
     close = np.abs(placed - plain).max(axis=-1) < MOST
     assert close.mean() > 0.99 and plain[..., 3].mean() > 0.02
-
-
-def test_several_objects_are_drawn_as_one() -> None:
-    splats, camera = random_splats(300, sh_degree=2), camera_at()
-    parts = [(splats.take(slice(0, 100)), np.eye(4)), (splats.take(slice(100, 300)), np.eye(4))]
-    whole = draw(shade([(splats, np.eye(4))], camera), camera, RasterSettings())
-    np.testing.assert_array_equal(draw(shade(parts, camera), camera, RasterSettings()), whole)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -252,37 +231,6 @@ def test_a_picture_with_more_tiles_than_their_numbers_hold_is_refused() -> None:
     ends = joined(*(one((x, 0, 0), 0.01, 1.0, (1, 1, 1)) for x in (-13.1, 13.1)))
     image = draw(ends, widest, RasterSettings())
     assert image[0, :700].any() and image[0, -700:].any() and not image[0, 700:-700].any()
-
-
-@pytest.mark.parametrize("scale", [(0.08, 0.08, 0.08), (0.5, 0.0005, 0.0005), (8.0, 0.01, 0.01), (6.0, 3.0, 0.001)])
-def test_rows_beside_an_ellipse_are_those_without_a_pixel_of_it(scale: tuple[float, float, float]) -> None:
-    """From small splats to needles that are as long as a splat may be; and half of the box's rows are left out."""
-    splats = shown(120, seed=3, most=5.0)
-    splats.scale[:] = np.float32(scale)
-    camera = camera_at(size=(200, 150), focal=(300.0, 300.0))
-    kept = boxed = 0
-    screen, boxes, keys = project_splats(splats, camera, RasterSettings())
-    across, down = np.meshgrid(np.arange(TILE), np.arange(TILE))
-    for key in keys:
-        row, box = screen[index_of(key)], boxes[index_of(key)]
-        for left in range(0, camera.width, TILE):
-            for top in range(0, camera.height, TILE):
-                local, lines = row.copy(), np.empty((BLOCKS, 2), np.int32)
-                size = min(TILE, camera.height - top), min(TILE, camera.width - left)
-                measure(local, left, top, *size, lines)
-                inside = exponent(row, left + across + 0.5 - row[X], top + down + 0.5 - row[Y]) >= row[LEAST]
-                inside[size[0] :] = inside[:, size[1] :] = False
-                in_box = (box[0] * TILE <= left <= box[1] * TILE) and (box[2] * TILE <= top <= box[3] * TILE)
-                assert in_box or not inside.any(), (row[X], row[Y], left, top)
-                tall = np.abs(top + np.arange(TILE) + 0.5 - row[Y]) <= row[HALF_HEIGHT]
-                for block, (above, below) in enumerate(lines):
-                    assert 0 <= above <= TILE and 0 <= below <= size[0]
-                    drawn = np.flatnonzero(inside[:, LANES * block : LANES * (block + 1)].any(axis=1))
-                    assert not drawn.size or (above <= drawn[0] and drawn[-1] < below), (row[X], row[Y], left, top)
-                    first = left + LANES * block
-                    if first - row[HALF_WIDTH] <= row[X] <= first + LANES + row[HALF_WIDTH]:
-                        kept, boxed = kept + max(0, below - above), boxed + tall.sum()
-    assert kept < 0.95 * boxed
 
 
 @pytest.mark.parametrize("sort", SORTS)

@@ -208,11 +208,6 @@ def test_chunk_files_without_a_tree_are_noted(tmp_path: Path) -> None:
     assert shown.note == "scene.rad: Spark streams trees only; bake it first with sparklod build-lod"
 
 
-def test_the_size_counts_chunk_files() -> None:
-    (shown,) = shown_files([CHUNKED])
-    assert shown.bytes == sum(path.stat().st_size for path in CHUNKED.parent.iterdir())
-
-
 def test_a_link_that_the_user_names_is_followed_once(tmp_path: Path) -> None:
     (tmp_path / "link.spz").symlink_to(TREE)
     (shown,) = shown_files([tmp_path / "link.spz"])
