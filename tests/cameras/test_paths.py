@@ -39,17 +39,7 @@ from sparklod_cli.cameras.sources import (
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.system.errors import CameraPathError, InvalidSplatsError
-from tests.cameras.known import (
-    FOCAL,
-    HALF_TURN,
-    KNOWN,
-    LANDMARK,
-    check_pose,
-    pixel,
-    read_fixture,
-    read_json,
-    text_file,
-)
+from tests.cameras.known import FOCAL, HALF_TURN, KNOWN, LANDMARK, check_pose, pixel, read_fixture, read_json, text_file
 
 
 def own(settings: Settings | None = None, **root: Any) -> CameraPath:
