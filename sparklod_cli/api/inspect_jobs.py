@@ -18,7 +18,7 @@ from ..system.progress import Progress
 from ..tables.assertions import Assertion
 
 if TYPE_CHECKING:
-    from ..images.tree_plot import DescribedPicture
+    from ..images.scene_plots import DescribedPicture
 
 
 #: Width and height of the thumbnail on a page, pixels; the splats of the cut that it shows; and the most splats of a
@@ -73,20 +73,20 @@ def inspect_file(
 
 
 def picture_of(scene: Scene | None, by: str, depth: int | None) -> tuple[DescribedPicture | None, str | None]:
-    """Return the picture of a scene's structure, see `tree_plot.plot`, or else the reason why it cannot be drawn."""
+    """Return the picture of a scene's structure, see `scene_plots.plot`, or else the reason why it cannot be drawn."""
     if scene is None:
         return None, "it does not hold all of its splats, so they cannot be drawn"
-    from ..images import tree_plot
+    from ..images import scene_plots
 
     try:
-        return tree_plot.plot(scene, by=by, depth=depth), None
+        return scene_plots.plot(scene, by=by, depth=depth), None
     except SparklodError as error:
         return None, str(error)
 
 
 def thumbnail_of(report: Report, scene: Scene, threads: int) -> DescribedPicture | None:
     """Return the scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
-    from ..images.tree_plot import DescribedPicture
+    from ..images.scene_plots import DescribedPicture
     from ..inspection.report import NO_CHILDREN
     from .files import as_tree
     from .views import cut, orbit, render, show

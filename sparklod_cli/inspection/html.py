@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..images.tree_plot import DescribedPicture
+from ..images.scene_plots import DescribedPicture
 from ..model.scene import Scene
 from ..system.units import count_of, format_size, percent_of
 from ..tables.histograms import Histogram, edge_names

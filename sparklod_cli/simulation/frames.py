@@ -257,14 +257,14 @@ def _charts(
     extremes: Mapping[str, SimulatedFrame],
 ) -> tuple[bytes, str | None]:
     """Return the charts, with the path over the cut of an extreme frame, and why that picture is missing, if it is."""
-    from ..images import charts
+    from ..images import charts, scene_plots
     from ..viewers.loaded_scene import TREE
 
     frames = [extremes[criterion] for criterion in (*(moment.criterion for moment in moments), "first")]
     # The first that draws anything, as none does before the first chunk has arrived.
     frame = next((each for each in frames if len(each.cut)), frames[0])
     cut = simulation.scenes.cut_of(frame.cut)
-    scene = charts.PathScene(
+    scene = scene_plots.PathScene(
         path.cameras,
         cut.splats,
         np.concatenate([part.depth for part in cut.parts]),

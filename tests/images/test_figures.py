@@ -17,11 +17,10 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.images import charts, pyvista_scene, tree_plot
-from sparklod_cli.images.charts import PathScene, frustum_lines, picture_of_path
+from sparklod_cli.images import charts, pyvista_scene, scene_plots
 from sparklod_cli.images.pixels import BACKGROUND
 from sparklod_cli.images.pyvista_scene import viewpoint
-from sparklod_cli.images.tree_plot import DescribedPicture, color_by
+from sparklod_cli.images.scene_plots import DescribedPicture, PathScene, color_by, frustum_lines, picture_of_path
 from sparklod_cli.lod import quick
 from sparklod_cli.model.gaussian import covariance, spark_size
 from sparklod_cli.model.lod_tree import LodTree
@@ -447,7 +446,7 @@ def scene() -> Scene:
 
 
 def plot(scene: Scene, *, size: tuple[int, int] = (320, 200), **options: object) -> DescribedPicture:
-    return tree_plot.plot(scene, size=size, **options)  # type: ignore[arg-type]
+    return scene_plots.plot(scene, size=size, **options)  # type: ignore[arg-type]
 
 
 def drawn(picture: DescribedPicture) -> np.ndarray:
@@ -508,7 +507,7 @@ def test_many_splats_are_points_and_more_are_a_sample(scene: Scene, monkeypatch:
     picture = plot(scene)
     assert "points" in picture.description
     assert drawn(picture).any()
-    monkeypatch.setattr(tree_plot, "MOST_POINTS", 1000)
+    monkeypatch.setattr(scene_plots, "MOST_POINTS", 1000)
     sample = plot(scene)
     assert "an even sample of 1,000" in sample.description
     assert sample.png == plot(scene).png != picture.png

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.images.tree_plot import DescribedPicture
+from sparklod_cli.images.scene_plots import DescribedPicture
 from sparklod_cli.inspection.html import FileSection, children_groups, page
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.values import histogram_of, names_of

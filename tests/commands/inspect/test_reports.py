@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.images import pyvista_scene, tree_plot
+from sparklod_cli.images import pyvista_scene, scene_plots
 from sparklod_cli.inspection.findings import CODES, Finding
 from sparklod_cli.system.errors import SparklodError
 from tests.commands.inspect.runs import BROKEN, CORRUPT, MISSING, NOTED, PLAIN, TREE, WARNED, inspect, records
@@ -168,10 +168,10 @@ def test_a_process_prints_findings_and_exits_3() -> None:
 def test_the_paths_of_page_and_picture_are_printed(
     tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def drawn(*args: object, **kwargs: object) -> tree_plot.DescribedPicture:
-        return tree_plot.DescribedPicture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
+    def drawn(*args: object, **kwargs: object) -> scene_plots.DescribedPicture:
+        return scene_plots.DescribedPicture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
 
-    monkeypatch.setattr(tree_plot, "plot", drawn)
+    monkeypatch.setattr(scene_plots, "plot", drawn)
     monkeypatch.setattr(pyvista_scene, "load_pyvista", lambda: None)  # which may be missing
     page, picture = tmp_path / "page.html", tmp_path / "picture.png"
     assert inspect(TREE, "--plot", picture, "--html", page) == 0

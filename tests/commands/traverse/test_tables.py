@@ -164,11 +164,11 @@ def test_a_plot_is_a_picture(tmp_path: Path, capsys: Capture) -> None:
 def test_a_plot_shows_what_the_frame_had(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over a slow network few chunks are there; the picture is of what was drawn with these."""
     pytest.importorskip("matplotlib", reason="charts need the extra `render`")
-    from sparklod_cli.images import charts
+    from sparklod_cli.images import charts, scene_plots
 
-    shown: list[charts.PathScene] = []
+    shown: list[scene_plots.PathScene] = []
 
-    def drawn(rows: object, marked: object, title: str, scene: charts.PathScene) -> tuple[bytes, str | None]:
+    def drawn(rows: object, marked: object, title: str, scene: scene_plots.PathScene) -> tuple[bytes, str | None]:
         shown.append(scene)
         return b"a plot", None
 
