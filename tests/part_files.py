@@ -21,8 +21,7 @@ from sparklod_cli.model.scene import DetailScene, Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import linear
-from tests.outputs import write_files
-from tests.scenes import random_splats
+from tests.scenes import random_splats, write_files
 
 #: Splats of each region at each level: there are empty runs, and a region that has only the last level.
 COUNTS = np.array([[40, 12, 3], [1, 1, 0], [30, 0, 4], [0, 0, 2], [25, 9, 9]])

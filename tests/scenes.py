@@ -1,4 +1,4 @@
-"""Random and hand-made splats to test with."""
+"""Random and hand-made splats to test with, trees as streams, and the files of outputs."""
 
 from __future__ import annotations
 
@@ -6,8 +6,11 @@ import numpy as np
 
 from fixtures import by_hand
 from sparklod_cli.model.gaussian import normalized_quat
+from sparklod_cli.model.lod_tree import LodTree, NodeStream
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS, SH_C0
 from sparklod_cli.model.splats import Splats
+from sparklod_cli.system.output import Files, Output
 
 
 def random_splats(count: int, *, sh_degree: int = 0, seed: int = 0, extent: float = 1.0) -> Splats:
@@ -48,3 +51,22 @@ def splat_columns(count: int, *, sh_degree: int = 0, seed: int = 0) -> dict[str,
         sh=splats.sh,
     )
     return {name: np.array(column, np.float32) for name, column in columns.items()}
+
+
+def node_stream(scene: Scene) -> NodeStream:
+    """The nodes of a scene with a tree, copied whenever they are read."""
+    tree = scene.tree
+    assert tree is not None
+
+    def read(start: int, stop: int) -> tuple[Splats, LodTree]:
+        assert 0 <= start < stop <= len(scene)
+        part = slice(start, stop)
+        return scene.splats.take(part), LodTree(tree.child_count[part].copy(), tree.child_start[part].copy())
+
+    return NodeStream(len(scene), scene.splats.sh_degree, scene.antialiased, read)
+
+
+def write_files(out: Output, files: Files) -> int:
+    """Write the files of an output; return their bytes."""
+    with out:
+        return sum(out.write(*file) for file in files)

@@ -1,4 +1,4 @@
-"""The file that --scene names: what it may say, and that whatever else it says is told in a line."""
+"""Instances files, which --scene names: their keys, and errors of one line for everything else."""
 
 from __future__ import annotations
 
@@ -28,37 +28,49 @@ def scene(tmp_path: Path) -> Path:
     return tmp_path / "scene.json"
 
 
-def test_an_instance_needs_only_its_file(scene: Path) -> None:
-    (place,) = written(scene, {"file": "trees/door.spz"})
+def test_an_instance_needs_only_its_file_which_may_be_anywhere(scene: Path) -> None:
+    place, *others = written(scene, {"file": "trees/door.spz"}, {"file": "/srv/a.spz"}, {"file": "../b.spz"})
     assert place.file == scene.parent / "trees" / "door.spz"
     assert (place.name, place.lod_scale, place.foveation) == ("door", 1.0, None)
     assert np.array_equal(place.object_to_world, np.eye(4))
-
-
-def test_the_file_of_an_instance_may_be_anywhere(scene: Path) -> None:
-    assert [place.file for place in written(scene, {"file": "/srv/a.spz"}, {"file": "../b.spz"})] == [
-        Path("/srv/a.spz"),
-        scene.parent / "../b.spz",
-    ]
+    assert [other.file for other in others] == [Path("/srv/a.spz"), scene.parent / "../b.spz"]
 
 
 def test_every_key_of_an_instance_is_used(scene: Path) -> None:
     turn = [0, math.sqrt(0.5), 0, math.sqrt(0.5)]  # a quarter around y: z goes to x
-    (place,) = written(
-        scene,
-        {
-            "file": "a.spz",
-            "name": "west wing",
-            "translation": [1, 2, 3],
-            "rotation": turn,
-            "scale": 2,
-            "lod_scale": 0.5,
-            "foveation": {"outside_foveate": 0.25, "behind_foveate": 0.125},
-        },
-    )
+    foveation = {"outside_foveate": 0.25, "behind_foveate": 0.125}
+    keys = {"name": "west wing", "translation": [1, 2, 3], "rotation": turn, "scale": 2, "lod_scale": 0.5}
+    (place,) = written(scene, {"file": "a.spz", "foveation": foveation} | keys)
     assert (place.name, place.lod_scale, place.foveation) == ("west wing", 0.5, Frustum(0.25, 0.125))
     assert np.allclose(place.object_to_world, [[0, 0, 2, 1], [0, 2, 0, 2], [-2, 0, 0, 3], [0, 0, 0, 1]], atol=1e-12)
-    assert set(KEYS) == {"file", "name", "translation", "rotation", "scale", "lod_scale", "foveation", "matrix"}
+    assert set(KEYS) == {"file", "foveation", "matrix", *keys}
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        ({"translation": [4, 5, 6]}, [[1, 0, 0, 4], [0, 1, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]]),
+        ({"scale": 3}, np.diag([3, 3, 3, 1])),
+        ({"scale": [3]}, np.diag([3, 3, 3, 1])),
+    ],
+)
+def test_parts_that_are_left_out_change_nothing(parts: dict[str, Any], expected: Any, scene: Path) -> None:
+    (place,) = written(scene, {"file": "a.spz"} | parts)
+    assert np.array_equal(place.object_to_world, expected)
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ({"cone_fov0": 90, "cone_fov": 120, "cone_foveate": 0.4, "behind_foveate": 0.2}, Cones(90, 120, 0.4, 0.2)),
+        ({}, Cones()),
+        ({"behind_foveate": 0.5}, Cones(behind=0.5)),
+        ({"outside_foveate": 0}, Frustum(0, 1)),
+        (None, None),
+    ],
+)
+def test_a_foveation_is_of_cones_or_a_frustum_by_its_keys(keys: Any, expected: Any, scene: Path) -> None:
+    assert written(scene, {"file": "a.spz", "foveation": keys})[0].foveation == expected
 
 
 numbers = st.floats(-1e3, 1e3)
@@ -86,36 +98,12 @@ def test_a_matrix_says_the_same_as_its_parts(
         assert np.allclose(first.object_to_world @ [*point, 1], [*expected, 1], rtol=1e-9, atol=1e-9)
 
 
-def test_parts_that_are_left_out_change_nothing(scene: Path) -> None:
-    for parts, index, value in (
-        ({"translation": [4, 5, 6]}, (slice(0, 3), 3), [4, 5, 6]),
-        ({"scale": 3}, (range(3), range(3)), [3, 3, 3]),
-        ({"scale": [3]}, (range(3), range(3)), [3, 3, 3]),
-    ):
-        (place,) = written(scene, {"file": "a.spz"} | parts)
-        expected = np.eye(4)
-        expected[index] = value
-        assert np.array_equal(place.object_to_world, expected)
-
-
-def test_a_foveation_is_of_cones_or_a_frustum_by_its_keys(scene: Path) -> None:
-    cones = {"cone_fov0": 90, "cone_fov": 120, "cone_foveate": 0.4, "behind_foveate": 0.2}
-    kinds = [cones, {}, {"behind_foveate": 0.5}, {"outside_foveate": 0}, None]
-    found = [
-        place.foveation for place in written(scene, *({"file": "a.spz", "foveation": foveation} for foveation in kinds))
-    ]
-    assert found == [Cones(90, 120, 0.4, 0.2), Cones(), Cones(behind=0.5), Frustum(0, 1), None]
-
-
 def test_names_are_given_where_there_are_none(scene: Path) -> None:
-    places = written(
-        scene,
-        *({"file": name} for name in ("a.spz", "x/a.spz", "total.spz", "a 2.spz")),
-        {"file": "b.spz", "name": "a"},
-        {"file": "b.spz", "name": ""},
-    )
-    names = [place.name for place in places]
-    assert names == ["a 2", "a 3", "total.spz", "a 2 2", "a", "b"]
+    named = [{"file": "b.spz", "name": "a"}, {"file": "b.spz", "name": ""}]
+    places = written(scene, *({"file": name} for name in ("a.spz", "x/a.spz", "total.spz", "a 2.spz")), *named)
+    assert [place.name for place in places] == ["a 2", "a 3", "total.spz", "a 2 2", "a", "b"]
+    many = written(scene, *({"file": "a.spz"} for _ in range(30_000)))  # in no time
+    assert len({place.name for place in many}) == 30_000
 
 
 WRONG: list[tuple[object, str]] = [
@@ -185,12 +173,17 @@ def test_a_mistake_is_told_in_a_line(wrong: object, said: str, scene: Path) -> N
         ('{"instances": [{"file": "a.spz"}', "is not JSON"),
         ("[" * 100_000, "is not JSON"),
         ("9" * 10_000, ""),
+        *(
+            ('{"instances": [{"file": "a", "scale": ' + "[" * depth + "]" * depth + "}]}", "")
+            for depth in range(900, 1000, 7)
+        ),
         ("[]", "has no list of instances"),
         ("{}", "has no list of instances"),
         ('{"instances": []}', "has no list of instances"),
         ('{"instances": {"file": "a.spz"}}', "has no list of instances"),
         ('{"instances": [{"file": "a", "name": "b"}, {"file": "c", "name": "b"}]}', "two instances are called 'b'"),
     ],
+    ids=lambda value: value[:20],
 )
 def test_files_that_are_not_instances_files_are_refused_in_one_line(text: str, said: str, scene: Path) -> None:
     scene.write_text(text)
@@ -201,29 +194,23 @@ def test_files_that_are_not_instances_files_are_refused_in_one_line(text: str, s
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("depth", range(900, 1000, 7))
-def test_deeply_nested_instances_files_are_refused(depth: int, scene: Path) -> None:
-    scene.write_text('{"instances": [{"file": "a", "scale": ' + "[" * depth + "]" * depth + "}]}")
-    with pytest.raises(InstancesFileError):
-        read_instances(scene)
-
-
-def test_an_unreadable_instances_file_is_named(tmp_path: Path) -> None:
+def test_an_unreadable_instances_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "bytes.json").write_bytes(b"\xff\xfe\x00")
     for path in (tmp_path / "missing.json", tmp_path, tmp_path / "bytes.json"):
         with pytest.raises(FormatError, match="cannot be read") as caught:
             read_instances(path)
         assert str(caught.value).startswith(str(path))
+    with pytest.raises(SparklodError, match="it is a pipe or a device"):
+        read_instances(Path("/dev/zero"))
+    monkeypatch.setattr("sparklod_cli.io.local_files.MAX_TEXT", 100)
+    (tmp_path / "large.json").write_bytes(b" " * 101)
+    with pytest.raises(SparklodError, match=r"large\.json is larger than"):
+        read_instances(tmp_path / "large.json")
 
 
 def test_a_byte_order_mark_is_no_mistake(scene: Path) -> None:
     scene.write_bytes(b'\xef\xbb\xbf{"instances": [{"file": "a.spz"}]}')
     assert len(read_instances(scene)) == 1
-
-
-def test_many_instances_take_no_time(scene: Path) -> None:
-    places = written(scene, *({"file": "a.spz"} for _ in range(30_000)))
-    assert len({place.name for place in places}) == 30_000
 
 
 cells = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
@@ -234,15 +221,6 @@ lists = st.lists(st.integers(-2, 2) | st.floats(), min_size=1, max_size=16)
 some_instances = st.dictionaries(st.sampled_from([*KEYS, "cone_fov", "outside_foveate"]), anything | lists, max_size=5)
 optional = dict.fromkeys(list(KEYS)[1:], anything | lists)
 plausible = st.fixed_dictionaries({"file": st.text(min_size=1)}, optional=optional)
-
-
-def test_endless_or_huge_instances_files_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(SparklodError, match="it is a pipe or a device"):
-        read_instances(Path("/dev/zero"))
-    monkeypatch.setattr("sparklod_cli.io.local_files.MAX_TEXT", 100)
-    (tmp_path / "large.json").write_bytes(b" " * 101)
-    with pytest.raises(SparklodError, match=r"large\.json is larger than"):
-        read_instances(tmp_path / "large.json")
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)

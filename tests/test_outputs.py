@@ -26,8 +26,8 @@ from sparklod_cli.system.errors import FormatError, OutputError
 from sparklod_cli.system.output import Output, check_writable, write_file
 from sparklod_cli.system.stdio import write_stdout
 from tests.conftest import FIXTURES, IS_ROOT
-from tests.outputs import write_files
 from tests.part_files import put_files
+from tests.scenes import write_files
 from tests.system.test_output import has_unnamed_files, held
 
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")

@@ -26,7 +26,7 @@ from sparklod_cli.viewers.paging import PagedScene
 from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.conftest import FIXTURES
-from tests.lod.forests import transform
+from tests.lod.trees import transform
 from tests.scenes import random_splats
 from tests.simulation.conftest import SPARK, around, camera, rows_of, without
 
@@ -44,11 +44,14 @@ def scene() -> Scene:
     return tree
 
 
-@pytest.fixture(scope="module")
-def file(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("pages") / "a.rad"
+def written(scene: Scene, path: Path) -> Path:
     path.write_bytes(b"".join(rad.encode(scene, WriteOptions(compression_level=1), threads=2)))
     return path
+
+
+@pytest.fixture(scope="module")
+def file(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return written(scene, tmp_path_factory.mktemp("pages") / "a.rad")
 
 
 @pytest.fixture
@@ -74,10 +77,6 @@ def both(chosen: list[Instance], **settings: str) -> tuple[Scenes, Scenes]:
     return whole, paged
 
 
-def chunks_read(scenes: Scenes) -> int:
-    return sum(int(loaded.pages.present.sum()) for loaded in scenes.loaded if isinstance(loaded, PagedScene))
-
-
 @pytest.mark.usefixtures("little_memory")
 @pytest.mark.parametrize("precision", ["float32", "packed"])
 @pytest.mark.parametrize(
@@ -94,13 +93,8 @@ def test_frames_are_those_of_a_tree_read_whole(
     whole, paged = both(instances(file), precision=precision)
     settings = LodSettings(budget, SPARK)
     path = around(4)
-    expected, found = (
-        [
-            without(row, {"traverse_ms"})
-            for row in rows_of(scenes, settings, path, streaming, by_instance=True, threads=2)
-        ]
-        for scenes in (whole, paged)
-    )
+    rows = [rows_of(scenes, settings, path, streaming, by_instance=True, threads=2) for scenes in (whole, paged)]
+    expected, found = ([without(row, {"traverse_ms"}) for row in each] for each in rows)
     assert found == expected
 
 
@@ -124,21 +118,16 @@ def test_cuts_are_those_of_a_tree_read_whole(file: Path, budget: int, limit: flo
 
 
 @pytest.mark.usefixtures("little_memory")
-def test_only_chunks_are_read_that_cuts_need(file: Path) -> None:
-    _, paged = both([Instance(file, "a")])
-    traversal = paged.viewer(LodSettings(3_000))
-    assert chunks_read(paged) == 1  # the root's
-    demand = np.zeros(paged.forest.chunks, np.bool_)
-    for at in (NEAR, NEAR, *around(3).cameras):
-        demand |= traversal.cut(at, budget=3_000).demand > 0
-    assert demand.sum() <= chunks_read(paged) < len(demand)
-
-
-@pytest.mark.usefixtures("little_memory")
-def test_splats_are_kept_as_far_as_there_is_room(file: Path) -> None:
+def test_only_chunks_are_read_that_cuts_need_and_few_are_cached(file: Path) -> None:
     whole, paged = both([Instance(file, "a")])
+    viewer = paged.viewer(LodSettings(3_000))
     (loaded,) = paged.loaded
     assert isinstance(loaded, PagedScene)
+    assert loaded.pages.present.sum() == 1  # the root's
+    demand = np.zeros(paged.forest.chunks, np.bool_)
+    for at in (NEAR, NEAR, *around(3).cameras):
+        demand |= viewer.cut(at, budget=3_000).demand > 0
+    assert demand.sum() <= loaded.pages.present.sum() < len(demand)
     loaded.pages._kept = 2
     rng = np.random.default_rng(0)
     for _ in range(3):
@@ -161,9 +150,7 @@ def test_cameras_see_what_they_see_of_scenes_read_whole(
         assert scene.tree is not None
         center = scene.splats.center.copy()
         center[np.flatnonzero(scene.tree.is_leaf)[::1000]] = np.nan
-        spoiled = Scene(dataclasses.replace(scene.splats, center=center), scene.tree)
-        file = tmp_path / "b.rad"
-        file.write_bytes(b"".join(rad.encode(spoiled, WriteOptions(compression_level=1), threads=2)))
+        file = written(Scene(dataclasses.replace(scene.splats, center=center), scene.tree), tmp_path / "b.rad")
     for module in (framing, paging):
         monkeypatch.setattr(module, "SAMPLE", 50_000)
     whole, paged = (scenes.balls() for scenes in both(instances(file)))
@@ -198,13 +185,6 @@ def test_commands_write_the_same_files(arguments: list[str], file: Path, tmp_pat
     assert written[0]
 
 
-def broken(scene: Scene, node: int, start: int) -> Scene:
-    assert scene.tree is not None
-    child_start = scene.tree.child_start.copy()
-    child_start[node] = start
-    return Scene(scene.splats, LodTree(scene.tree.child_count, child_start))
-
-
 @pytest.mark.usefixtures("little_memory")
 def test_links_are_checked_in_chunks_that_are_read(scene: Scene, tmp_path: Path) -> None:
     assert scene.tree is not None
@@ -217,8 +197,9 @@ def test_links_are_checked_in_chunks_that_are_read(scene: Scene, tmp_path: Path)
         (second, int(scene.tree.child_start[inner[0]]) + 1, "shares children with another node"),
         (far, far, None),
     ):
-        path = tmp_path / "broken.rad"
-        path.write_bytes(b"".join(rad.encode(broken(scene, node, start), WriteOptions(compression_level=1), threads=2)))
+        child_start = scene.tree.child_start.copy()
+        child_start[node] = start
+        path = written(Scene(scene.splats, LodTree(scene.tree.child_count, child_start)), tmp_path / "broken.rad")
         paged = read_scenes([Instance(path, "a")], paged=True)
         if what is None:
             CutFinder(paged, LodSettings(300)).cut(NEAR)

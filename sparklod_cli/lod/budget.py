@@ -14,10 +14,10 @@ SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
 #: A share that is not in percent.
 FRACTION = re.compile(r"0?\.[0-9]{1,9}")
 
-#: A comma in digits that no list of budgets has: none begins with a zero.
+#: A comma that groups digits: no budget of a list begins with a zero.
 GROUPED_LIST = re.compile(r"[0-9],0")
 
-#: Counts below it are probably a share or thousands: they draw nothing that a person would recognise.
+#: Smaller counts are probably meant as a share or as thousands: they draw nothing recognisable.
 FEW = 100
 
 #: The largest count: up to it, every table format stores integers exactly.
@@ -33,7 +33,7 @@ class Budget:
         share: share of the leaves of all instances together; None for a count.
         count: number of splats; None for a share.
         scale: factor for the budget, Spark's `lodSplatScale`.
-        by_default: not chosen by the user; viewers of another format have another default.
+        by_default: not chosen by the user, so that viewers of other formats take their own default.
     """
 
     text: str

@@ -44,7 +44,7 @@ OUTLIERS = 0.02
 #: Coordinates of viewpoints end where float32 does: scenes may reach that far themselves.
 LARGEST = float(np.finfo(np.float32).max)
 
-#: The least budget of viewers, as a share of the nodes, but no more than one chunk. Chosen.
+#: Least budget of viewers, as a share of the nodes, and at most one chunk. Chosen.
 LEAST_BUDGET = 1 / 16
 
 #: Bases of the Halton sequences that viewpoints are made of.
@@ -65,10 +65,9 @@ FIRST_BAND, BAND_GROWTH = 4096, 4
 SIGN = np.uint32(1 << 31)
 
 Matrix = NDArray[np.float64]
-
 Index = NDArray[np.int32]
 
-#: Families that are looked at together on the way up the tree. Chosen.
+#: Families processed at a time on the way up the tree. Chosen.
 _ROWS = 1 << 16
 
 
@@ -121,7 +120,7 @@ def family_order(
     _, limit = find_limits(parent, size)
     for members in parts_of(parent, center, limit, most or len(parent)):
         with threads_for(len(members)) as threads:
-            at = slice(None) if len(members) == len(parent) else members  # all of them without a copy
+            at = slice(None) if len(members) == len(parent) else members  # without a copy of all
             # Parents first: by descending limit.
             keys = np.uint64(0x7FFFFFFF) - limit[at].view(np.uint32).astype(np.uint64)
             largest = sort_by_key(keys, np.arange(len(members), dtype=np.uint32), 31, threads)[1]
@@ -193,8 +192,8 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
     sequence = np.arange(length, dtype=np.int32)
     set_of, root, spare = (np.full(length, -1, np.int32) for _ in range(3))
     weight = np.empty(length, np.int64)
-    # Where a set begins, where it ends, its nodes, and for the first one how many of its nodes fit into the chunk that
-    # was begun: beside the root, or behind the part before.
+    # Begin and end of each set, its nodes, and for the first set the number of nodes that fit into the chunk that the
+    # root or the part before has begun.
     room = -filled % CHUNK_NODES
     sets, ends, used = ([(0, length, own, room)] if room or own > CHUNK_NODES else []), [0, length], 0
     while sets:
@@ -213,7 +212,7 @@ def _sequence(families: Families, filled: int, total: int, progress: Progress) -
         sets = [part for part in parts if part[2] > CHUNK_NODES]
         progress("arranging", filled + own - sum(nodes for _, _, nodes, _ in sets), total, "node")
     bits = (length - 1).bit_length()
-    set_of[:] = -1  # numbers of sets are none of chunks
+    set_of[:] = -1  # numbers of sets are not numbers of chunks
     bounds = np.unique(ends)
     sort_within_chunks(len(bounds) - 1, bounds, families.parent, families.rank, bits, sequence, set_of, root)
     return sequence

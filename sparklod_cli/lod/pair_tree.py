@@ -193,7 +193,7 @@ class BinaryTree:
         return found
 
     def keep_rows(self, slots: Nodes) -> None:
-        """Drop all rows but those of some merged nodes, which are numbered from the first.
+        """Keep only the rows of some merged nodes, numbered from the first merged one.
 
         In place: a copy would be a large part of the memory of a build.
         """

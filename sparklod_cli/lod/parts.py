@@ -63,8 +63,9 @@ ALPHA_WEIGHT = 1.0
 #: scenes differ by 0.6 and more. Chosen.
 SIZES_DIFFER = 0.3
 
-#: Splats or pairs that are worked on at a time, so that their columns stay in the cache. Chosen.
+#: Splats or pairs processed at a time, so that their columns stay in the cache. Chosen.
 BLOCK = 1 << 14
+
 Nodes = NDArray[np.int64]
 Column = NDArray[np.float64]
 
@@ -167,7 +168,7 @@ def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> tuple[
     return [np.flatnonzero(tree.is_leaf), *cuts], order.parent
 
 
-@np.errstate(over="ignore", invalid="ignore")  # where splats are as large as numbers are
+@np.errstate(over="ignore", invalid="ignore")  # where splats are as large as float32 allows
 def losses(nodes: Splats, tree: LodTree, parent: NDArray[np.int32]) -> Column:
     """Return the (M,) float64 loss of each node drawn instead of its subtree, not less than the losses in that.
 
@@ -341,7 +342,7 @@ def beyond(splats: Splats, radius: float) -> NDArray[np.bool_]:
     """Return a (N,) mask of the splats whose centres are farther than a radius from the middle of the scene.
 
     Raises:
-        InvalidSplatsError: all are.
+        InvalidSplatsError: all splats are farther.
     """
     middle = middle_of(splats)
     offset = splats.center - middle

@@ -3,17 +3,17 @@
 The levels are those of Spark's method ("Quick LoD algorithm"): a splat of size s = 2 * max(scale) belongs to level
 ceil(log_base(s)), and from the finest level up, the splats of a level join the survivors of the level below. There, all
 nodes that share a cell become one. Here, cells are wider, and in each the cheapest pairs of neighbours merge for a few
-rounds, up to a size that grows with the level; what became one node is a family (`kernels/cell_pairs.py`).
+rounds, up to a size that grows with the level; the nodes merged into one are a family (`kernels/cell_pairs.py`).
 benchmarks/notes/quick-builder.md has the reasons, and the alternatives that were tried.
 
 For speed, leaves are sorted once, by level and Morton code, into rows with all data that a merge reads, so that each
 level reads neighbouring memory. A level is a radix sort of its cells and one parallel merge. As the nodes of a level
 are made in Morton order, writing the levels out backwards gives the final order, coarse before fine.
 
-The same tree can be built in stages, node for node and bit for bit. Of a region, only cells get a node that no other
-node of the scene can be in; what lies in the others is left. Where unknown nodes will be merged is unknown, too, but in
-the cells that their members lie in: a mean lies between its terms, and float32 rounds it no further. So what is unknown
-at a level ends where the cells of the level below end that something unknown could be in.
+The same tree can be built in stages, node for node and bit for bit. In a region, only those cells are merged that no
+node from outside can be in; the nodes of the other cells are handed on. Nodes from outside merge into a node within the
+cells of its members: a mean lies between its terms, and float32 rounds it no further. So the margin of possible nodes
+from outside grows by whole cells, level by level.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ from .kernels.sort import (
 from .stages import NO_FAMILY, STAGE_BITS, Bounds, Margins, Pending, Region, StageFamilies, check
 from .tree_settings import DEFAULT_BASE, MAX_BASE, MIN_BASE
 
-#: Level of splats that have not joined the tree yet: they do so at the level of their size.
+#: Level of splats that have not joined the tree: they join at the level of their size.
 NEW = -1
 
-#: More than the levels of any scene: sizes and distances of float32 span 2 ** 278, and the base is at least 1.1.
+#: Upper bound of the levels of a scene: sizes and distances of float32 span 2 ** 278, and the base is at least 1.1.
 LEVELS = 4096
 
 #: Largest coordinate in steps of a level: parts are half a step wide, their coordinates int64, and so must be their
@@ -82,10 +82,10 @@ FARTHEST = 1e15
 #: float32, the base is at least 1.1), fit a uint64.
 CURVE_BITS = 17
 
-#: In place of the number of a given node, for a merged one.
+#: Number of merged nodes, which are not numbered as given nodes are.
 MERGED = np.uint32(0xFFFFFFFF)
 
-#: Rows that are moved at a time: their copies stay in a processor's cache.
+#: Rows moved at a time: their copies stay in a processor's cache.
 MOVED = 1 << 14
 
 Offsets = NDArray[np.int64]

@@ -22,7 +22,7 @@ from ..system.threads import BLOCK_ROWS, threads_for
 from .kernels.geometry import find_bounds
 from .kernels.sort import PART_BITS, Nodes, Parts, split_box
 
-#: Message on splats without an opacity or a size, whose selection keeps them by mistake.
+#: Message on splats without an opacity or a size, which a selection should have dropped.
 INVISIBLE = "a splat is without opacity or scale: see Selection.apply"
 
 

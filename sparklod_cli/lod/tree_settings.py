@@ -23,8 +23,8 @@ MIN_GROWTH, MAX_GROWTH, DEFAULT_GROWTH = 1.05, 2.0, 1.4
 #: Growth of the tree that the detail levels of a Streamed SOG are cut from: as it is not written, it keeps all nodes.
 DETAIL_GROWTH = MAX_GROWTH
 
-#: Bytes that a splat takes at the peak of a bake: without spherical harmonics, and for each of their coefficients.
-#: Peaks of processes (VmHWM), as `benchmarks/bench_memory.py` measures them, with some room to spare.
+#: Bytes of a splat at the peak of a bake, without spherical harmonics and for each of their coefficients: peaks of
+#: processes (VmHWM), as `benchmarks/bench_memory.py` measures them, with some reserve.
 SplatBytes = tuple[int, int]
 
 
@@ -45,10 +45,10 @@ class Builder:
         summary: phrase for help texts.
         in_bands: its trees are put in the order of `band_order` for files that are read whole. That saves 3 to 4 % of
             a file of quality, and 1 to 2 % of one of quick, which is not worth the time.
-        in_memory: of a splat of the input, in memory.
-        in_block: of a splat of a block, out of core.
-        in_scratch: of a splat of the input in the scratch folder, out of core. Those of blocks are removed when their
-            nodes are made.
+        in_memory: bytes of a splat of the input in a bake in memory.
+        in_block: bytes of a splat of a block out of core.
+        in_scratch: bytes of a splat of the input in the scratch folder out of core, where splats of a block are removed
+            when its nodes are made.
     """
 
     setting: str

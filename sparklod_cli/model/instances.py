@@ -7,21 +7,16 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import TOTAL
 from .foveation import Foveation
-from .scene import Scene
+from .scene import DetailScene, Scene, TileScene
+from .transforms import LARGEST, SKEW, Transform, scale_of
 
-if TYPE_CHECKING:
-    from .scene import DetailScene, TileScene
-    from .transforms import Transform
-
-    Source = Path | Scene | DetailScene | TileScene
-
+Source = Path | Scene | DetailScene | TileScene
 Matrix = NDArray[np.float64]
 
 
@@ -31,11 +26,11 @@ class Instance:
 
     Attributes:
         source: a splat file (a path, which may be a string), or a scene in memory.
-        name: in messages and tables; unique among the instances of a run.
+        name: for messages and tables; unique among the instances of a run.
         object_to_world: (4, 4) rotation, uniform scale and translation.
         lod_scale: multiplies the pixel scales of its nodes, or the distances at which its detail levels begin; above 1
             it gets more of the budget than others.
-        foveation: its own; None for that of the viewer.
+        foveation: None for that of the viewer.
 
     Raises:
         TypeError: the source is neither.
@@ -51,19 +46,13 @@ class Instance:
     def __post_init__(self) -> None:
         if isinstance(self.source, str):
             object.__setattr__(self, "source", Path(self.source))
-        if not isinstance(self.source, (Path, Scene)):
-            from .scene import DetailScene, TileScene
-
-            if not isinstance(self.source, (DetailScene, TileScene)):
-                raise TypeError(f"an instance is of a file or a scene, not of {type(self.source).__name__}")
+        if not isinstance(self.source, (Path, Scene, DetailScene, TileScene)):
+            raise TypeError(f"an instance is of a file or a scene, not of {type(self.source).__name__}")
         matrix = np.asarray(self.object_to_world, np.float64)
         if matrix.shape != (4, 4):
             raise ValueError(f"object_to_world has the shape {matrix.shape}; give (4, 4)")
-        if not np.array_equal(matrix, np.eye(4)):
-            from .transforms import scale_of
-
-            if scale_of(matrix, math.inf) is None:
-                raise ValueError("object_to_world is no rotation, uniform scale and translation of finite numbers")
+        if scale_of(matrix, math.inf) is None:
+            raise ValueError("object_to_world is no rotation, uniform scale and translation of finite numbers")
         object.__setattr__(self, "object_to_world", matrix)
 
     @property
@@ -74,8 +63,6 @@ class Instance:
     @property
     def transform(self) -> Transform:
         """Similarity in `object_to_world`, with the nearest rotation if the axes are slightly skewed."""
-        from .transforms import LARGEST, SKEW, Transform
-
         axes = self.object_to_world[:3, :3]
         scale = min(max(float(np.cbrt(np.linalg.det(axes))), 1 / LARGEST), LARGEST)
         rotation = axes / scale

@@ -139,7 +139,7 @@ class Nodes:
     size: FloatArray
     tree: LodTree
 
-    #: Whether nodes are read as cuts need them.
+    #: Whether nodes are read from the file when cuts need them.
     paged: ClassVar[bool] = False
 
     @property

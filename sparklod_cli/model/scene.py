@@ -26,7 +26,7 @@ from .splats import Splats, describe_invalid
 #: alike. Then the ends of the range of the logarithms, where the codes have one; else 0.
 ScaleCoding = tuple[str, float, float]
 
-#: That of plain numbers, and that of SPZ.
+#: Codings of plain numbers and of SPZ.
 PLAIN_SCALES: ScaleCoding = ("", 0.0, 0.0)
 SPZ_SCALES: ScaleCoding = ("spz", 0.0, 0.0)
 
@@ -36,8 +36,8 @@ class FileCoding:
     """Codings of the scales in a file.
 
     Attributes:
-        scales: of each run of splats, in order.
-        run: splats of each run but the last.
+        scales: coding of each run of splats, in order.
+        run: number of splats of each run but the last.
         packed_range: ends of the range of logarithms in which Spark packs the scales of the file as PackedSplats, where
             the file sets one (RAD's "splatEncoding"); None for Spark's own.
     """
@@ -77,21 +77,21 @@ ASSUMED = "-y"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scene:
-    """Splats, and what a file says of them all.
+    """Splats and the metadata of their file.
 
     The columns of splats become read-only views, so that a scene cannot change after it was drawn. Arrays that were
-    passed in keep their flags; what is drawn after a write to one of them is undefined. The columns of the tree, a
-    tenth of its bytes at most, are copied, so that a tree which was valid stays valid.
+    passed in keep their flags; pictures drawn after a write to one of them are undefined. The columns of the tree, a
+    tenth of its bytes at most, are copied, so that a valid tree stays valid.
 
     Attributes:
         splats: N splats, in the order and the axes of the file.
         tree: (N,) nodes where the file is a Level-of-Detail tree, else None.
         antialiased: trained with the opacity compensation of Mip-Splatting.
-        format: what it was read from, for display ("PLY", "SPZ 4").
-        notes: what the reader had to leave out, for display.
-        header: numbers of the file's header that the splats do not tell, by name ("version", "fractional_bits").
-        chunk_bytes: of each of its chunks in the file, where its format has chunks; None elsewhere.
-        coding: of the scales in the file; None for float32.
+        format: name of the file format, for display ("PLY", "SPZ 4").
+        notes: losses in reading the file, for display.
+        header: further numbers of the file's header, by name ("version", "fractional_bits").
+        chunk_bytes: bytes of each chunk in the file; None for formats without chunks.
+        coding: coding of the scales in the file; None for float32.
         up: the axis that points up, one of `AXES` ("y", "-z"); None where it is unknown.
         up_by: the format that specifies this axis ("SPZ", "glTF"); empty if the file names it, or it is unknown.
     """

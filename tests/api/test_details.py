@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import sparklod_cli as sparklod
-from tests.lod.details import row_of_regions
+from tests.lod.trees import row_of_regions
 from tests.part_files import write_streamed
 
 AT = sparklod.Camera.look_at([0, 0, -6], [0, 0, 0], size=(48, 32))

@@ -56,8 +56,7 @@ from sparklod_cli.system.progress import silent
 from sparklod_cli.tables import histograms
 from tests.conftest import FIXTURES, real_scene
 from tests.lod.trees import hard_cases
-from tests.node_streams import node_stream
-from tests.scenes import random_splats, splat_columns
+from tests.scenes import node_stream, random_splats, splat_columns
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -25,8 +25,7 @@ from sparklod_cli.model.splats import COLUMNS, Splats, same_rows
 from sparklod_cli.system.progress import silent
 from tests.codecs.cases import assert_same, decode, encode
 from tests.conftest import FIXTURES, real_scene
-from tests.node_streams import node_stream
-from tests.scenes import random_splats
+from tests.scenes import node_stream, random_splats
 
 PALETTE = WriteOptions(rad=RadOptions(sh_codes=40))
 

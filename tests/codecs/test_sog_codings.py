@@ -21,7 +21,7 @@ from sparklod_cli.codecs.sog_images import CODES, codebook, even_codebook, neare
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import rotation_degrees, stated_degrees
-from tests.references.sog_quats import decode_quat
+from tests.references.sh_palettes import decode_quat
 
 
 def quats() -> np.ndarray:

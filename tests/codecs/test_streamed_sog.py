@@ -33,9 +33,8 @@ from tests.codecs.damage import VALUES, attempt, places_of, replaced
 from tests.codecs.test_laws import assert_close
 from tests.codecs.writers import sog_precision
 from tests.conftest import FIXTURES
-from tests.outputs import write_files
 from tests.part_files import CHILDREN, COUNTS, detail_scene, open_companion, put_files, regions_of
-from tests.scenes import random_splats
+from tests.scenes import random_splats, write_files
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from tests.conftest import FIXTURES, Capture
-from tests.lod.details import row_of_regions
+from tests.lod.trees import row_of_regions
 from tests.part_files import write_streamed
 
 AT = ("--look-at", "0,0,-6:0,0,0", "--size", "48x32")

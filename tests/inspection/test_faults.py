@@ -35,8 +35,7 @@ from tests.conftest import FIXTURES, Capture, real_scene
 from tests.inspection import rad_files, streamed_sog_files, tiles_files
 from tests.inspection.test_schema import faults as schema_faults
 from tests.inspection.test_schema import holder, places
-from tests.outputs import write_files
-from tests.scenes import random_splats
+from tests.scenes import random_splats, write_files
 
 FOLDER = FIXTURES / "faults"
 

@@ -38,7 +38,7 @@ from sparklod_cli.render.render_settings import RasterSettings
 from tests.conftest import FIXTURES, ROOT
 from tests.interop.node import Node
 from tests.interop.pictures import cameras_around, psnr
-from tests.outputs import write_files
+from tests.scenes import write_files
 
 # --- Pages of the documentation ---------------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ from sparklod_cli.viewers.cut import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.interop.node import Node
-from tests.lod.sights import CutView
+from tests.lod.trees import CutView
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ import pytest
 from sparklod_cli.viewers.playcanvas import Chains, Distant, RegionBounds, choose
 from sparklod_cli.viewers.viewer_settings import DetailRule
 from tests.interop.node import Node
-from tests.lod.details import Regions, random_regions, random_view
-from tests.lod.sights import CutView
+from tests.lod.trees import CutView, Regions, random_regions, random_view
 
 pytestmark = pytest.mark.slow
 

@@ -41,10 +41,9 @@ from tests.fittings import stand_in as stand_in
 from tests.interop.spark import NODE, PageUpdate, Spark
 from tests.interop.spark_words import Words
 from tests.interop.test_spark_files import chunks_of
-from tests.lod.forests import links, rotation, transform
-from tests.lod.sights import CutView
-from tests.references import budgeted_cuts
-from tests.references.dynamic_cuts import dynamic_limit
+from tests.lod.trees import CutView, links, rotation, transform
+from tests.references import cuts as references
+from tests.references.cuts import dynamic_limit
 from tests.scenes import random_splats
 from tests.simulation.conftest import around
 
@@ -250,7 +249,7 @@ def test_pixel_scales_are_those_of_spark_bit_for_bit(spark: Spark) -> None:
         moved = transform(rng, scale=math.exp(rng.normal())) if number % 2 else np.eye(4)
         instance = TreeInstance(0, moved, rng.uniform(0.1, 3), FOVEATIONS[rng.integers(len(FOVEATIONS))])
         (view,) = views_of(whole.forest, [instance], CutView(camera, FOV_Y, FOV_Y))
-        scale = budgeted_cuts.pixel_scale(whole.forest.nodes[view["node_base"]], view)
+        scale = references.pixel_scale(whole.forest.nodes[view["node_base"]], view)
         if scale > 0:
             assert len(whole.check([instance], camera, 9, float(np.nextafter(scale, np.float32(0))))) == 2
         assert len(whole.check([instance], camera, 9, float(scale))) == 1

@@ -1,4 +1,4 @@
-"""The order of nodes in chunks: the same tree, whole families in full chunks, and fewer chunks for a view."""
+"""The orders of nodes: in chunks of whole families, of which views need few; and in bands from coarse to fine."""
 
 from __future__ import annotations
 
@@ -13,22 +13,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.lod import chunk_order, quality, quick
-from sparklod_cli.lod.chunk_order import arrange, family_order, parts_of
-from sparklod_cli.lod.chunk_order import chunk_order as order_of
+from sparklod_cli.lod.chunk_order import arrange, banded, family_order, parts_of
 from sparklod_cli.lod.kernels.chunk_sets import LANES, fill_demand
 from sparklod_cli.lod.kernels.pixel_scale import NODE
-from sparklod_cli.lod.kernels.tree_links import find_limits, find_parents
+from sparklod_cli.lod.kernels.tree_links import find_limits
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree, Nodes
-from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.threads import on_threads
 from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import LodSettings
-from tests.lod.forests import links
-from tests.lod.sights import CutView
-from tests.lod.trees import check_threads
-from tests.references import chunk_splits
+from tests.lod.trees import CutView, check_threads, check_tree, children, links, parents, same, sorted_rows
+from tests.references import chunk_orders
 from tests.references.chunk_orders import reordered, spark_order
 from tests.scenes import random_splats
 
@@ -43,6 +40,17 @@ def small_chunks() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def built() -> tuple[Splats, LodTree]:
+    """A tree of five chunks."""
+    return quick.build(random_splats(220_000, seed=2))
+
+
+@pytest.fixture(scope="module")
+def quality_tree() -> tuple[Splats, LodTree]:
+    return quality.build(random_splats(60_000, seed=3), 1.3)
+
+
 def grown(fan_out: list[int], seed: int = 0) -> tuple[Splats, LodTree]:
     """A tree whose inner nodes have so many children, which scatter around their parents and are mostly smaller."""
     rng = np.random.default_rng(seed)
@@ -51,37 +59,42 @@ def grown(fan_out: list[int], seed: int = 0) -> tuple[Splats, LodTree]:
     center, scale = splats.center, splats.scale
     center[0], scale[0] = 0, 1
     for node in np.flatnonzero(tree.child_count):
-        part = slice(int(tree.child_start[node]), int(tree.child_start[node]) + int(tree.child_count[node]))
-        count = part.stop - part.start
+        part, count = children(tree, node), int(tree.child_count[node])
         center[part] = center[node] + rng.normal(size=(count, 3)) * scale[node]
         scale[part] = scale[node] * rng.uniform(0.3, 1.1, (count, 1))
-    numbered = dataclasses.replace(splats, rgb=np.arange(3 * len(tree), dtype=np.float32).reshape(-1, 3))
-    return numbered, tree
+    return dataclasses.replace(splats, rgb=np.arange(3 * len(tree), dtype=np.float32).reshape(-1, 3)), tree
 
 
-def check_same_tree(before: tuple[Splats, LodTree], after: tuple[Splats, LodTree]) -> np.ndarray:
-    """The same splats, root and children, by colours that number them; returns the old node at each place."""
+def numbers_of(splats: Splats) -> np.ndarray:
+    """The numbers that nodes of `grown` have in their colours."""
+    return (splats.rgb[:, 0] / 3).astype(np.int64)
+
+
+def limits(nodes: Splats, tree: LodTree) -> np.ndarray:
+    """The least size from the root to each node."""
+    limit, parent = spark_size(nodes).copy(), parents(tree)
+    for node in range(1, len(tree)):
+        limit[node] = min(limit[node], limit[parent[node]])
+    return limit
+
+
+def check_same_tree(before: tuple[Splats, LodTree], after: tuple[Splats, LodTree]) -> None:
+    """The same splats, root and children."""
     (splats, tree), (ordered, arranged) = before, after
     arranged.validate()
-    old = (ordered.rgb[:, 0] / 3).astype(np.int64)
+    old = numbers_of(ordered)
     assert np.array_equal(np.sort(old), np.arange(len(tree)))
-    for name in ("center", "scale", "quat_xyzw", "opacity", "rgb", "sh"):
+    for name in COLUMNS:
         assert np.array_equal(getattr(ordered, name), getattr(splats, name)[old])
     assert old[0] == 0
     assert np.array_equal(arranged.child_count, tree.child_count[old])
     for node in np.flatnonzero(arranged.child_count):
-        count = int(arranged.child_count[node])
-        first, now = int(tree.child_start[old[node]]), int(arranged.child_start[node])
-        assert old[now : now + count].tolist() == list(range(first, first + count))
-    return old
-
-
-fan_outs = st.lists(st.integers(1, 7), max_size=60)
+        assert old[children(arranged, node)].tolist() == list(range(len(tree))[children(tree, old[node])])
 
 
 @pytest.mark.usefixtures("small_chunks")
 class TestSmallChunks:
-    @given(fan_outs, st.integers(0, 3))
+    @given(st.lists(st.integers(1, 7), max_size=60), st.integers(0, 3))
     @settings(max_examples=60)
     def test_it_is_the_same_tree(self, fan_out: list[int], seed: int) -> None:
         tree = grown(fan_out, seed)
@@ -91,44 +104,41 @@ class TestSmallChunks:
     def test_chunks_are_those_of_plain_lists(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         splats, tree = grown(rng.integers(2, 6, 40 + 20 * seed).tolist(), seed)
-        expected, arranged_parent, rank, bits = plainly(splats, tree)
+        expected, arranged_parent, rank, bits = plain_chunks(splats, tree)
         ordered, arranged = arrange(splats, tree)
-        old = (ordered.rgb[:, 0] / 3).astype(np.int64)
         inner = np.flatnonzero(arranged.child_count)
-        families = old[inner[np.argsort(arranged.child_start[inner])]].tolist()
+        families = numbers_of(ordered)[inner[np.argsort(arranged.child_start[inner])]].tolist()
         at = 0
         for chunk in expected:
             nodes, numbers = families[at : at + len(chunk)], dict(chunk)
             at += len(chunk)
             assert sorted(nodes) == sorted(numbers)
             members = [number for _, number in chunk]
-            keys = dict(zip(members, chunk_splits.inside(members, arranged_parent, rank, bits), strict=True))
+            keys = dict(zip(members, chunk_orders.inside(members, arranged_parent, rank, bits), strict=True))
             got = [keys[numbers[node]] for node in nodes]
             assert got == sorted(got)
         assert at == len(families)
 
 
-def plainly(splats: Splats, tree: LodTree) -> tuple[list[list[tuple[int, int]]], list[int], list[list[int]], int]:
+def plain_chunks(splats: Splats, tree: LodTree) -> tuple[list[list[tuple[int, int]]], list[int], list[list[int]], int]:
     """(node, family) of each chunk by plain lists; and parents, ranks and bits of the families' numbers."""
-    size = spark_size(splats)
-    parent, limit = np.full(len(tree), -1), size.copy()
-    for node in np.flatnonzero(tree.child_count):
-        for child in range(int(tree.child_start[node]), int(tree.child_start[node]) + int(tree.child_count[node])):
-            parent[child], limit[child] = node, min(size[child], limit[node])
+    size, parent = spark_size(splats), parents(tree)
+    limit = limits(splats, tree)
     nodes = sorted(np.flatnonzero(tree.child_count).tolist(), key=lambda node: (-limit[node], node))
     number = {node: at for at, node in enumerate(nodes)}
-    above = [number.get(int(parent[node]), -1) for node in nodes]
+    above = [number[int(parent[node])] if node else -1 for node in nodes]
     centers = splats.center[nodes]
     rank = np.argsort(np.argsort(centers, axis=0, kind="stable"), axis=0).tolist()
     records = np.zeros(len(nodes), NODE)
     records["x"], records["y"], records["z"] = centers.T
     records["size"], records["child_count"] = size[nodes], tree.child_count[nodes]
     least, most = min(len(tree) / 16, SMALL), len(tree)
-    columns = [chunk_splits.demand(records, above, view, least, most) for view in chunk_order.viewpoints(centers)]
+    columns = [chunk_orders.demand(records, above, view, least, most) for view in chunk_order.viewpoints(centers)]
     demand = np.array(columns).T.tolist()
-    counts = tree.child_count[nodes].tolist()
-    chunks = chunk_splits.Splitter(above, counts, rank, demand, SMALL).chunks()
-    return [[(nodes[f], f) for f in chunk] for chunk in chunks], above, rank, (len(nodes) - 1).bit_length()
+    counts = tree.child_count[nodes].astype(int).tolist()
+    chunks = chunk_orders.Splitter(above, counts, rank, demand, SMALL).chunks()
+    bits = (len(nodes) - 1).bit_length()
+    return [[(nodes[family], family) for family in chunk] for chunk in chunks], above, rank, bits
 
 
 @pytest.mark.parametrize(
@@ -136,27 +146,31 @@ def plainly(splats: Splats, tree: LodTree) -> tuple[list[list[tuple[int, int]]],
     [[], [1], [1] * 300, [65535], [65535, *[3] * 40], [65535] * 3, [2] * 200, [9, *[0] * 8, 5]],
     ids=["one node", "two", "chain", "star", "star and more", "three stars", "small", "deep at the end"],
 )
-def test_degenerate_trees(fan_out: list[int]) -> None:
+def test_degenerate_trees_keep_their_links(fan_out: list[int]) -> None:
     tree = grown(fan_out)
     check_same_tree(tree, arrange(*tree))
 
 
 @pytest.mark.parametrize("name", ["center", "scale"])
 @pytest.mark.parametrize("value", [0.0, 1e30])
-def test_equal_centres_and_sizes(name: str, value: float) -> None:
+def test_trees_with_equal_centres_or_sizes_keep_their_links(name: str, value: float) -> None:
     splats, tree = grown([3] * 30_000)
-    splats = dataclasses.replace(splats, **{name: np.full_like(getattr(splats, name), value)})
+    getattr(splats, name)[:] = value
     check_same_tree((splats, tree), arrange(splats, tree))
 
 
-@pytest.fixture(scope="module")
-def built() -> Iterator[tuple[Splats, LodTree]]:
-    """A tree of five chunks."""
-    yield quick.build(random_splats(220_000, seed=2))
+def test_nodes_without_a_size_are_not_lost() -> None:
+    """Sizes that are not numbers count as none, as a viewer would never refine such a node."""
+    splats, tree = grown([3] * 30_000)
+    splats.scale[5:50] = np.nan
+    order, child_start = chunk_order.chunk_order(splats, tree)
+    assert np.array_equal(np.sort(order), np.arange(len(tree)))
+    LodTree(tree.child_count[order], child_start).validate()
 
 
-def test_the_number_of_threads_changes_nothing(built: tuple[Splats, LodTree]) -> None:
+def test_threads_do_not_change_a_bit(built: tuple[Splats, LodTree]) -> None:
     check_threads(lambda: arrange(*built))
+    check_threads(lambda: banded([quick.build(random_splats(20_000, seed=3), 1.5)]))
 
 
 def test_chunks_are_not_taken_for_sets(built: tuple[Splats, LodTree], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,28 +189,21 @@ def test_chunks_are_not_taken_for_sets(built: tuple[Splats, LodTree], monkeypatc
     assert asked == [-1]
 
 
-def test_the_first_chunk_is_a_coarse_picture_of_the_whole(built: tuple[Splats, LodTree]) -> None:
-    """It refines the largest nodes: none outside is larger than all but the last inside."""
+def test_the_first_chunk_refines_the_largest_nodes_and_no_family_is_in_two_chunks(
+    built: tuple[Splats, LodTree],
+) -> None:
+    """No node outside is larger than all but the last inside."""
     splats, tree = arrange(*built)
-    limit = spark_size(splats).astype(np.float64)
-    for node in np.flatnonzero(tree.child_count):
-        part = slice(int(tree.child_start[node]), int(tree.child_start[node]) + int(tree.child_count[node]))
-        limit[part] = np.minimum(limit[part], limit[node])
     inner = ~tree.is_leaf
-    in_first = tree.child_start[inner] + tree.child_count[inner].astype(np.int64) <= CHUNK_NODES
-    sizes = limit[inner]
-    fits = np.sort(sizes[in_first])
-    assert fits[100] >= sizes[~in_first].max()
-
-
-def test_no_family_is_in_two_chunks(built: tuple[Splats, LodTree]) -> None:
-    _, tree = arrange(*built)
-    start = tree.child_start[~tree.is_leaf].astype(np.int64)
-    assert np.array_equal(start // CHUNK_NODES, (start + tree.child_count[~tree.is_leaf] - 1) // CHUNK_NODES)
+    first = tree.child_start[inner].astype(np.int64)
+    last = first + tree.child_count[inner] - 1
+    assert np.array_equal(first // CHUNK_NODES, last // CHUNK_NODES)
+    sizes, in_first = limits(splats, tree)[inner], last < CHUNK_NODES
+    assert np.sort(sizes[in_first])[100] >= sizes[~in_first].max()
 
 
 @pytest.mark.slow
-def test_views_touch_fewer_chunks_than_in_spark_s_order() -> None:
+def test_views_touch_fewer_chunks_than_in_sparks_order() -> None:
     """A ring of clusters, seen from among them: an example; docs/streaming-measured.md has the measurements."""
     rng = np.random.default_rng(5)
     angle = rng.integers(0, 24, 200_000) * (2 * np.pi / 24)
@@ -214,15 +221,12 @@ def test_views_touch_fewer_chunks_than_in_spark_s_order() -> None:
 
 def cut_at(tree: tuple[Splats, LodTree], turn: float) -> TreeCut:
     """The cut of a viewer on the ring who looks along it."""
-    across = np.array([np.cos(turn), 0, np.sin(turn)])
-    along = np.array([-np.sin(turn), 0, np.cos(turn)])
+    across, along = np.array([np.cos(turn), 0, np.sin(turn)]), np.array([-np.sin(turn), 0, np.cos(turn)])
     pose = np.eye(4)
-    pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = across, [0, 1, 0], -along, 9 * across
-    foveation = LodSettings().foveation
-    found = SparkViewer(
-        Forest([Nodes(tree[0].center, spark_size(tree[0]), tree[1])]), [TreeInstance(foveation=foveation)]
-    )
-    return found.cut(CutView(pose, 1.5, 1.0), budget=40_000)
+    pose[:3] = np.stack([across, [0, 1, 0], -along, 9 * across], axis=1)
+    forest = Forest([Nodes(tree[0].center, spark_size(tree[0]), tree[1])])
+    viewer = SparkViewer(forest, [TreeInstance(foveation=LodSettings().foveation)])
+    return viewer.cut(CutView(pose, 1.5, 1.0), budget=40_000)
 
 
 def test_progress_ends_at_the_number_of_nodes(built: tuple[Splats, LodTree]) -> None:
@@ -232,20 +236,54 @@ def test_progress_ends_at_the_number_of_nodes(built: tuple[Splats, LodTree]) -> 
     assert done == sorted(done) and seen[-1] == ("arranging", len(built[1]), len(built[1]), "node")
 
 
-def test_nodes_without_a_size_come_last_and_are_not_lost() -> None:
-    """Sizes that are not numbers count as none, as a viewer would never refine such a node."""
-    splats, tree = grown([3] * 30_000)
-    scale = splats.scale.copy()
-    scale[5:50] = np.nan
-    splats = dataclasses.replace(splats, scale=scale)
-    order, child_start = chunk_order.chunk_order(splats, tree)
-    assert np.array_equal(np.sort(order), np.arange(len(tree)))
-    LodTree(tree.child_count[order], child_start).validate()
+def test_arranging_twice_is_arranging_once(built: tuple[Splats, LodTree]) -> None:
+    """But for ties, of which this tree has none."""
+    once = arrange(*built)
+    assert same(arrange(*once), once)
+
+
+# Families
+
+
+class Families(NamedTuple):
+    """The arguments of `family_order`."""
+
+    parent: np.ndarray
+    count: np.ndarray
+    center: np.ndarray
+    size: np.ndarray
+
+    @classmethod
+    def of(cls, splats: Splats, tree: LodTree) -> Families:
+        nodes, parent = chunk_order.families_of(tree)
+        return cls(parent, tree.child_count[nodes], splats.center[nodes], spark_size(splats)[nodes])
+
+    @property
+    def limit(self) -> np.ndarray:
+        return find_limits(self.parent, np.fmax(self.size, np.float32(0)))[1]
+
+    def parts(self, most: int) -> list[np.ndarray]:
+        return list(parts_of(self.parent, self.center, self.limit, most))
+
+
+def random_families(count: int, seed: int) -> Families:
+    """Families below random others; sizes of a few values, so that there are ties."""
+    rng = np.random.default_rng(seed)
+    parent = np.array([-1, *(rng.integers(max(0, i - 20), i) for i in range(1, count))], np.int32)
+    size = rng.choice([0.5, 1, 2, np.nan], count).astype(np.float32)
+    return Families(parent, rng.integers(1, 9, count).astype(np.uint16), rng.random((count, 3), np.float32), size)
+
+
+def check_order(families: Families, sequence: np.ndarray) -> None:
+    """All families, parents first."""
+    place = np.empty(len(sequence), np.int64)
+    place[sequence] = np.arange(len(sequence))
+    assert np.array_equal(np.sort(sequence), np.arange(len(families.parent)))
+    assert (place[families.parent[1:]] < place[1:]).all()
 
 
 def test_demand_never_rises_from_parent_to_child() -> None:
-    rng = np.random.default_rng(1)
-    count = 500
+    rng, count = np.random.default_rng(1), 500
     parent = np.concatenate([[-1], [rng.integers(0, i) for i in range(1, count)]]).astype(np.int32)
     nodes = np.zeros(count, NODE)
     for name in ("x", "y", "z"):
@@ -259,81 +297,36 @@ def test_demand_never_rises_from_parent_to_child() -> None:
 
 
 def test_families_take_the_memory_that_is_estimated() -> None:
-    rng, families = np.random.default_rng(3), 1 << 17
-    parent = ((np.arange(families) - 1) // 3).astype(np.int32)
+    rng, count = np.random.default_rng(3), 1 << 17
+    parent = ((np.arange(count) - 1) // 3).astype(np.int32)
     parent[0] = -1
-    count, center = np.full(families, 3, np.uint16), rng.random((families, 3), np.float32)
-    size = np.exp(-6 * rng.random(families)).astype(np.float32)
-    chunk_order.family_order(parent[:9], count[:9], center[:9], size[:9])  # loads kernels
+    size = np.exp(-6 * rng.random(count)).astype(np.float32)
+    families = Families(parent, np.full(count, 3, np.uint16), rng.random((count, 3), np.float32), size)
+    family_order(*(column[:9] for column in families))  # loads kernels
     tracemalloc.start()
     try:
         with on_threads(2):
-            chunk_order.family_order(parent, count, center, size)
+            family_order(*families)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert peak / families == pytest.approx(chunk_order.family_bytes(2), rel=0.1)
-
-
-class Families(NamedTuple):
-    """The arguments of `family_order`."""
-
-    parent: np.ndarray
-    count: np.ndarray
-    center: np.ndarray
-    size: np.ndarray
-
-    def parts(self, most: int) -> list[np.ndarray]:
-        limit = find_limits(self.parent, np.fmax(self.size, np.float32(0)))[1]
-        return list(parts_of(self.parent, self.center, limit, most))
-
-
-def random_tree(count: int, seed: int) -> Families:
-    """Families below random others; sizes of a few values, so that there are ties."""
-    rng = np.random.default_rng(seed)
-    parent = np.array([-1, *(rng.integers(max(0, i - 20), i) for i in range(1, count))], np.int32)
-    size = rng.choice([0.5, 1, 2, np.nan], count).astype(np.float32)
-    return Families(parent, rng.integers(1, 9, count).astype(np.uint16), rng.random((count, 3), np.float32), size)
-
-
-def families_of(splats: Splats, tree: LodTree) -> Families:
-    nodes = np.flatnonzero(tree.child_count)
-    number = np.full(len(tree), -1, np.int32)
-    number[nodes] = np.arange(len(nodes))
-    above = find_parents(tree.child_count, tree.child_start)[0][nodes]
-    parent = np.where(above < 0, np.int32(-1), number[above])
-    return Families(parent, tree.child_count[nodes], splats.center[nodes], spark_size(splats)[nodes])
-
-
-def check_order(families: Families, sequence: np.ndarray) -> None:
-    """All families, parents first."""
-    place = np.empty(len(sequence), np.int64)
-    place[sequence] = np.arange(len(sequence))
-    assert np.array_equal(np.sort(sequence), np.arange(len(families.parent)))
-    assert (place[families.parent[1:]] < place[1:]).all()
+    assert peak / count == pytest.approx(chunk_order.family_bytes(2), rel=0.1)
 
 
 @given(st.integers(1, 400), st.integers(0, 1000), st.integers(1, 100))
 @settings(max_examples=60)
 def test_parts_are_small_and_parents_come_first(count: int, seed: int, most: int) -> None:
-    families = random_tree(count, seed)
+    families = random_families(count, seed)
     parts = families.parts(most)
     assert max(map(len, parts)) <= most and min(map(len, parts)) >= 1
     check_order(families, np.concatenate(parts))
     assert all((np.diff(part) > 0).all() for part in parts)
-
-
-def test_the_first_part_has_the_largest_families() -> None:
-    families = random_tree(500, 4)
-    limit = find_limits(families.parent, np.fmax(families.size, np.float32(0)))[1]
-    first = families.parts(60)[0]
-    rest = np.delete(limit, first)
-    assert len(first) == 60 and limit[first].min() >= rest.max()
-
-
-@pytest.fixture(scope="module")
-def quality_tree() -> tuple[Splats, LodTree]:
-    return quality.build(random_splats(60_000, seed=3), 1.3)
+    rest = np.delete(families.limit, parts[0])
+    assert len(parts[0]) == min(most, count) and families.limit[parts[0]].min() >= rest.max(initial=-1)
+    with pytest.MonkeyPatch.context() as patch:  # parts do not depend on how many families are processed at a time
+        patch.setattr(chunk_order, "_ROWS", 16)
+        again = families.parts(most)
+    assert len(again) == len(parts) and all(map(np.array_equal, again, parts))
 
 
 @pytest.mark.parametrize("most", [700, 4_000])
@@ -342,8 +335,10 @@ def test_chunks_are_full_across_parts(
 ) -> None:
     """Each part goes on where the one before ends, so that hardly a family lies in two chunks."""
     monkeypatch.setattr(chunk_order, "CHUNK_NODES", 1_024)
-    families = families_of(*quality_tree)
+    families = Families.of(*quality_tree)
+    before = [column.copy() for column in families]
     sequence = family_order(*families, most=most)
+    assert all(map(np.array_equal, families, before))
     check_order(families, sequence)
     last = np.cumsum(families.count[sequence].astype(np.int64))  # the root is node 0
     first = last - families.count[sequence] + 1
@@ -353,33 +348,79 @@ def test_chunks_are_full_across_parts(
 
 
 def test_one_part_is_the_order_of_the_tree(quality_tree: tuple[Splats, LodTree]) -> None:
-    families, (_, tree) = families_of(*quality_tree), quality_tree
+    families, (_, tree) = Families.of(*quality_tree), quality_tree
     assert len(families.parts(len(families.parent))) == 1
     sequence = family_order(*families, most=len(families.parent))
-    order, _ = order_of(*quality_tree)
+    order, _ = chunk_order.chunk_order(*quality_tree)
     first = tree.child_start[np.flatnonzero(tree.child_count)[sequence]]
     assert np.array_equal(first, order[np.cumsum([1, *families.count[sequence]])[:-1]])
 
 
-def test_an_order_does_not_depend_on_the_one_before(built: tuple[Splats, LodTree]) -> None:
-    """But for ties, of which this tree has none: arranging twice is arranging once."""
-    once = arrange(*built)
-    twice = arrange(*once)
-    assert np.array_equal(once[1].child_start, twice[1].child_start)
-    assert np.array_equal(once[0].center, twice[0].center)
+# Bands
 
 
-def test_parts_are_the_same_whatever_is_looked_at_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    families = random_tree(900, 1)
-    expected = families.parts(70)
-    monkeypatch.setattr("sparklod_cli.lod.chunk_order._ROWS", 16)
-    found = families.parts(70)
-    assert len(found) == len(expected) and all(map(np.array_equal, found, expected))
+@pytest.fixture(scope="class")
+def small_bands() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chunk_order, "FIRST_BAND", 16)
+        yield
 
 
-def test_an_order_leaves_its_arguments(quality_tree: tuple[Splats, LodTree]) -> None:
-    families = families_of(*quality_tree)
-    before = [column.copy() for column in families]
-    family_order(*families, most=2_000)
-    for column, values in zip(families, before, strict=True):
-        assert np.array_equal(column, values)
+def bands_of(nodes: Splats, tree: LodTree) -> tuple[np.ndarray, np.ndarray]:
+    """The parents of families in the order of these, and the band of each: by how many nodes larger ones need."""
+    inner = np.flatnonzero(tree.child_count)
+    order = np.argsort(-limits(nodes, tree)[inner], kind="stable")
+    needed = np.cumsum(tree.child_count[inner][order].astype(int)) - tree.child_count[inner][order]
+    band = np.empty(len(inner), int)
+    band[order] = [sum(n >= 16 * 4**k for k in range(20)) for n in needed]
+    by_children = np.argsort(tree.child_start[inner])
+    return inner[by_children], band[by_children]
+
+
+@pytest.mark.usefixtures("small_bands")
+class TestSmallBands:
+    @given(st.integers(2, 400), st.integers(0, 2**32 - 1), st.sampled_from(["quick", "quality"]))
+    @settings(max_examples=15)
+    def test_bands_go_from_coarse_to_fine_and_each_along_the_tree(self, count: int, seed: int, method: str) -> None:
+        splats = random_splats(count, sh_degree=1, seed=seed)
+        before, links_before = quick.build(splats, 1.3) if method == "quick" else quality.build(splats, 1.4)
+        nodes, tree = banded([(before, links_before)])
+        check_tree(splats, nodes, tree)
+        assert np.array_equal(sorted_rows(nodes), sorted_rows(before))
+        order, _ = bands_of(nodes, tree)
+        # Bands are counted in the order that the tree had: sizes that are equal are in it.
+        old, band = bands_of(before, links_before)
+        band_of = {before.center[node].tobytes(): b for node, b in zip(old, band, strict=True)}
+        found = np.array([band_of[nodes.center[node].tobytes()] for node in order])
+        assert (np.diff(found) >= 0).all()
+        # In a band, a family is followed by those of its own members that are in it.
+        parent = parents(tree)
+        place = {int(node): at for at, node in enumerate(order)}
+        ends = np.arange(len(order)) + 1
+        for at in reversed(range(len(order))):
+            for node in range(*children(tree, order[at]).indices(len(tree))):
+                if node in place and found[place[node]] == found[at]:
+                    ends[at] = max(ends[at], ends[place[node]])
+        for at, node in enumerate(order):
+            if node and found[place[int(parent[node])]] == found[at]:
+                assert place[int(parent[node])] < at < ends[place[int(parent[node])]]
+            assert (found[at : ends[at]] == found[at]).all()
+
+    def test_siblings_keep_their_order(self) -> None:
+        before, links_before = quick.build(random_splats(2_000, seed=1), 1.5)
+        nodes, tree = banded([(before, links_before)])
+        place = {row.tobytes(): at for at, row in enumerate(before.center)}
+        old = np.array([place[row.tobytes()] for row in nodes.center])
+        for node in np.flatnonzero(tree.child_count):
+            assert (np.diff(old[children(tree, node)]) == 1).all()
+
+    def test_the_end_of_a_band_is_an_even_scene(self) -> None:
+        """Nodes refined in later bands are smaller than nodes refined before, but for the family across the border."""
+        nodes, tree = banded([quality.build(random_splats(5_000, seed=2), 1.4)])
+        limit, (order, band) = limits(nodes, tree), bands_of(nodes, tree)
+        for end in np.flatnonzero(np.diff(np.maximum.accumulate(band))):
+            assert limit[order[: end + 1]].min() >= limit[order[end + 1 :]].max()
+
+    def test_a_single_node_stays(self) -> None:
+        nodes, tree = banded([quick.build(random_splats(1), 1.5)])
+        assert len(nodes) == len(tree) == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 
@@ -16,23 +17,16 @@ from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.viewers.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, shares
 from sparklod_cli.viewers.cut import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
-from tests.lod.forests import Case, cases, random_tree, transform
-from tests.lod.sights import CutView
-from tests.references import budgeted_cuts, continuous_cuts
+from tests.lod.trees import Case, CutView, cases, children, drawn, random_tree, transform, view_from
+from tests.references import cuts as references
 
 WIDTHS = (1.05, 1.25, 2.0)
 SPARK = Cones(90, 120, 0.4, 0.2)
 
 
-def view_from(position: tuple[float, ...]) -> CutView:
-    camera = np.eye(4)
-    camera[:3, 3] = position
-    return CutView(camera, math.radians(80), math.radians(60))
-
-
 def weights_of(case: Case, cut: BlendedCut) -> list[np.ndarray]:
     """Of each instance, the weight of every node of its tree."""
-    weights = [np.zeros(len(case.trees[instance.tree].size)) for instance in case.instances]
+    weights = [np.zeros(len(case.tree(instance))) for instance in case.instances]
     for instance, node, weight in zip(cut.instance, cut.node, cut.weight, strict=True):
         assert weights[instance][node] == 0  # no node comes twice
         weights[instance][node] = weight
@@ -42,11 +36,10 @@ def weights_of(case: Case, cut: BlendedCut) -> list[np.ndarray]:
 def sums_to_leaves(case: Case, weights: list[np.ndarray]) -> Iterator[float]:
     """Of each leaf of each instance, the sum of the weights on the way to it."""
     for instance, of_nodes in zip(case.instances, weights, strict=True):
-        tree = case.trees[instance.tree].tree
+        tree = case.tree(instance)
         total = of_nodes.copy()
         for node in np.flatnonzero(tree.child_count):
-            start = int(tree.child_start[node])
-            total[start : start + int(tree.child_count[node])] += total[node]
+            total[children(tree, node)] += total[node]
         yield from total[tree.is_leaf]
 
 
@@ -55,26 +48,20 @@ def some_case(seed: int, count: int = 400, foveation: Cones = SPARK) -> Case:
     rng = np.random.default_rng(seed)
     tree = random_tree(rng, count, 5)
     instances = [TreeInstance(0, np.eye(4), 1.0, foveation), TreeInstance(0, transform(rng, spread=4), 0.7, foveation)]
-    return Case([tree], instances, view_from((0.3, -0.2, 6.0)), count // 2, 0.0)
+    return Case([tree], instances, view_from(0.3, -0.2, 6.0), count // 2)
 
 
-@given(cases(), st.sampled_from(WIDTHS))
+def blended(case: Case, width: float) -> BlendedCut:
+    return ContinuousCuts(case.viewer()).cut(case.view, budget=case.budget, smallest=case.smallest, width=width)
+
+
+@given(st.one_of(cases(), st.integers(0, 2).map(lambda seed: some_case(seed, 6000))), st.sampled_from(WIDTHS))
 def test_the_cut_is_that_of_numpy_to_the_last_bit(case: Case, width: float) -> None:
-    check_against_numpy(case, width)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_cuts_of_larger_trees_are_those_of_numpy_to_the_last_bit(seed: int) -> None:
-    check_against_numpy(some_case(seed, 6000), 1.25)
-
-
-def check_against_numpy(case: Case, width: float) -> None:
-    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, smallest=case.smallest, width=width)
-    found = case.traversal()
-    sizes = [len(case.trees[instance.tree].size) for instance in case.instances]
-    views = found.cut(case.view, budget=len(case.instances)).views
-    nodes, weights, threshold = continuous_cuts.continuous_cut(
-        found.forest.nodes, views, sizes, case.budget, case.smallest, width
+    cut, viewer = blended(case, width), case.viewer()
+    sizes = [len(case.tree(instance)) for instance in case.instances]
+    views = viewer.cut(case.view, budget=len(case.instances)).views
+    nodes, weights, threshold = references.continuous_cut(
+        viewer.forest.nodes, views, sizes, case.budget, case.smallest, width
     )
     assert cut.threshold == threshold
     assert cut.node.tolist() == np.concatenate(nodes).tolist()
@@ -86,7 +73,7 @@ def check_against_numpy(case: Case, width: float) -> None:
 def test_weights_are_shares_that_sum_to_one_on_every_way_to_a_leaf_and_keep_the_budget(
     case: Case, width: float
 ) -> None:
-    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, smallest=case.smallest, width=width)
+    cut = blended(case, width)
     assert ((cut.weight > 0) & (cut.weight <= 1)).all()
     assert cut.threshold >= case.smallest
     assert cut.weight.sum() <= case.budget * (1 + 1e-9)
@@ -98,51 +85,42 @@ def test_weights_are_shares_that_sum_to_one_on_every_way_to_a_leaf_and_keep_the_
 def test_weights_sum_to_the_budget_where_that_is_what_ends_the_cut(width: float, share: float) -> None:
     case = some_case(1)
     leaves = len(case.instances) * int(case.trees[0].tree.is_leaf.sum())
-    budget = max(2, int(share * leaves))
-    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=budget, width=width)
-    assert cut.weight.sum() == pytest.approx(budget, rel=1e-6)
+    case = dataclasses.replace(case, budget=max(2, int(share * leaves)))
+    assert blended(case, width).weight.sum() == pytest.approx(case.budget, rel=1e-6)
 
 
 @given(cases(), st.sampled_from(WIDTHS))
 def test_with_a_large_budget_all_leaves_have_weight_one(case: Case, width: float) -> None:
-    case = Case(case.trees, case.instances, case.view, case.most, 0.0)
-    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, width=width)
-    ordinary = case.find()
-    assert [cut.node[cut.instance == number].tolist() for number in range(len(case.instances))] == [
-        nodes.tolist() for nodes in ordinary.indices()
-    ]
+    case = dataclasses.replace(case, budget=case.most, smallest=0.0)
+    cut = blended(case, width)
+    assert set(drawn(cut)) == set(drawn(case.find()))
     assert (cut.weight == 1).all()
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_without_a_range_to_fade_in_it_is_the_ordinary_cut(seed: int) -> None:
     case = some_case(seed)
-    ordinary = case.find()
-    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.budget, width=1 + 1e-9)
-    # Both divide in the same order; what does not fit any more is divided by a share here, and not at all there.
+    ordinary, cut = case.find(), blended(case, 1 + 1e-9)
+    # Both refine in the same order; the node that does not fit is refined by a share here, and not at all there.
     assert ordinary.stop is not None
     _, instance, node = ordinary.stop
     tree = case.trees[0].tree
-    partly = {(instance, node)} | {
-        (instance, int(tree.child_start[node]) + child) for child in range(int(tree.child_count[node]))
-    }
-    whole = {
-        (int(i), int(n)) for i, n, w in zip(cut.instance, cut.node, cut.weight, strict=True) if w == pytest.approx(1)
-    }
-    drawn = set(zip(ordinary.instance.tolist(), ordinary.node.tolist(), strict=True))
-    assert whole - partly == drawn - partly
-    assert len(drawn) > 100
+    partly = {(instance, node), *((instance, child) for child in np.arange(len(tree))[children(tree, node)].tolist())}
+    whole = {each for each, weight in zip(drawn(cut), cut.weight, strict=True) if weight == pytest.approx(1)}
+    nodes = set(drawn(ordinary))
+    assert whole - partly == nodes - partly
+    assert len(nodes) > 100
 
 
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("seed", range(3))
 def test_weights_move_no_faster_than_pixel_scales(width: float, seed: int) -> None:
     case = some_case(seed)
-    cuts = ContinuousCuts(case.traversal())
+    cuts = ContinuousCuts(case.viewer())
     before = scales = None
     changed = 0
     for step in range(60):
-        view = view_from((0.3, -0.2, 6.0 - 0.004 * step**1.5))
+        view = view_from(0.3, -0.2, 6.0 - 0.004 * step**1.5)
         cut = cuts.cut(view, budget=case.budget, width=width)
         weights, now = np.concatenate(weights_of(case, cut)), log_scales(case, view)
         if before is not None:
@@ -201,32 +179,26 @@ def test_fading_is_even_in_d_and_ends_at_the_splat_itself() -> None:
 @given(cases())
 def test_at_a_threshold_the_cut_is_that_of_all_larger_nodes(case: Case) -> None:
     """Without a budget, the nodes far above the limit are divided, and none below it."""
-    cut = ContinuousCuts(case.traversal()).cut(case.view, budget=case.most, smallest=0.5, width=1.25)
-    case = Case(case.trees, case.instances, case.view, case.most, 0.5)
-    fine, coarse = case.find(), Case(case.trees, case.instances, case.view, case.most, 0.5 * 1.25).find()
-    drawn = set(zip(cut.instance.tolist(), cut.node.tolist(), strict=True))
-    both = {(int(i), int(n)) for i, n in zip(fine.instance, fine.node, strict=True)} & {
-        (int(i), int(n)) for i, n in zip(coarse.instance, coarse.node, strict=True)
-    }
-    assert both <= drawn
+    case = dataclasses.replace(case, budget=case.most, smallest=0.5)
+    fine, coarse = (set(drawn(dataclasses.replace(case, smallest=limit).find())) for limit in (0.5, 0.5 * 1.25))
+    assert fine & coarse <= set(drawn(blended(case, 1.25)))
 
 
 def test_a_tiny_step_across_a_threshold_changes_next_to_nothing() -> None:
     case = some_case(3, foveation=Cones())
-    cuts = ContinuousCuts(case.traversal())
+    cuts = ContinuousCuts(case.viewer())
     far, near = 6.0, 3.0
-    drawn = [
-        {tuple(node) for node in zip(cut.instance.tolist(), cut.node.tolist(), strict=True)}
-        for cut in (case.traversal().cut(view_from((0.3, -0.2, z)), budget=case.budget) for z in (far, near))
-    ]
-    assert drawn[0] != drawn[1]
+
+    def nodes_from(z: float) -> set[tuple[int, int]]:
+        return set(drawn(dataclasses.replace(case, view=view_from(0.3, -0.2, z)).find()))
+
+    first = nodes_from(far)
+    assert nodes_from(near) != first
     for _ in range(40):  # to where the ordinary cut changes
         middle = (far + near) / 2
-        ordinary = case.traversal().cut(view_from((0.3, -0.2, middle)), budget=case.budget)
-        same = set(zip(ordinary.instance.tolist(), ordinary.node.tolist(), strict=True)) == drawn[0]
-        far, near = (middle, near) if same else (far, middle)
+        far, near = (middle, near) if nodes_from(middle) == first else (far, middle)
     a, b = (
-        np.concatenate(weights_of(case, cuts.cut(view_from((0.3, -0.2, z)), budget=case.budget, width=1.25)))
+        np.concatenate(weights_of(case, cuts.cut(view_from(0.3, -0.2, z), budget=case.budget, width=1.25)))
         for z in (far, near)
     )
     assert np.abs(a - b).max() < 1e-4
@@ -234,14 +206,12 @@ def test_a_tiny_step_across_a_threshold_changes_next_to_nothing() -> None:
 
 @given(cases())
 def test_pixel_scales_are_those_of_the_traversal(case: Case) -> None:
-    traversal = case.traversal()
+    traversal = case.viewer()
     views = traversal.cut(case.view, budget=len(case.instances)).views
     nodes = traversal.forest.nodes
     for number, view in enumerate(views):
         some = nodes[view["node_base"] : view["node_base"] + 20]
         found = np.empty(len(some), np.float32)
         pixel_scales(some, np.arange(len(some)), views, number, found)
-        expected = [
-            budgeted_cuts.number_of(budgeted_cuts.bits_of(budgeted_cuts.pixel_scale(node, view))) for node in some
-        ]
+        expected = [references.number_of(references.bits_of(references.pixel_scale(node, view))) for node in some]
         np.testing.assert_array_equal(found, np.array([math.inf if math.isnan(e) else e for e in expected], np.float32))

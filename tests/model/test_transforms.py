@@ -1,4 +1,4 @@
-"""Splats that are turned, scaled and moved look the same to a camera that is turned, scaled and moved with them."""
+"""Transforms of splats, which look the same to a camera that moves with them; and places on the Earth."""
 
 from __future__ import annotations
 
@@ -12,10 +12,18 @@ from hypothesis import strategies as st
 
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.images.metrics import psnr
-from sparklod_cli.model import UP_AXES
-from sparklod_cli.model.gaussian import covariance
 from sparklod_cli.model.splats import COLUMNS, Splats
-from sparklod_cli.model.transforms import LARGEST, ROWS, Transform, sh_basis, sh_rotations
+from sparklod_cli.model.transforms import (
+    FLATTENING,
+    LARGEST,
+    RADIUS,
+    ROWS,
+    Transform,
+    earth_matrix,
+    place_of,
+    sh_basis,
+    sh_rotations,
+)
 from sparklod_cli.render.rasterizer import Image, draw, shade
 from sparklod_cli.render.render_settings import RasterSettings
 from tests.references.gaussians import covariance as reference_covariance
@@ -117,14 +125,9 @@ def test_centres_and_covariances_follow_the_matrix(transform: Transform, seed: i
     before = reference_covariance(splats.scale, splats.quat_xyzw)
     after = reference_covariance(moved.scale, moved.quat_xyzw)
     np.testing.assert_allclose(after, axes @ before @ axes.T, atol=1e-5 * np.abs(after).max())
+    np.testing.assert_allclose(np.linalg.norm(moved.quat_xyzw.astype(np.float64), axis=1), 1, atol=3e-7)
     np.testing.assert_array_equal(moved.rgb, splats.rgb)
     np.testing.assert_array_equal(moved.opacity, splats.opacity)
-
-
-@given(transforms())
-def test_quaternions_stay_unit(transform: Transform) -> None:
-    length = np.linalg.norm(transform.apply(random_splats(50)).quat_xyzw.astype(np.float64), axis=1)
-    np.testing.assert_allclose(length, 1, atol=3e-7)
 
 
 def test_scales_and_moves_touch_nothing_else() -> None:
@@ -165,12 +168,9 @@ def test_invalid_splats_stay_invalid_and_others_are_unharmed() -> None:
     splats.scale[3, 0] *= -1
     moved = Transform.from_parts(rotate=(10, 20, 30), scale=3, translate=(1, 2, 3)).apply(splats)
     np.testing.assert_array_equal(moved.is_valid(), [False, False, False, False, True])
-
-
-def test_splats_beyond_float32_become_invalid_without_a_warning() -> None:
-    splats = random_splats(2)
-    splats.center[0] = 1e30
-    assert Transform(scale=1e11).apply(splats).is_valid().tolist() == [False, True]
+    far = random_splats(2)
+    far.center[0] = 1e30  # it leaves the range of float32
+    assert Transform(scale=1e11).apply(far).is_valid().tolist() == [False, True]
 
 
 # Composition
@@ -243,10 +243,6 @@ def test_what_is_up_becomes_y_and_right_stays_right(
     np.testing.assert_array_equal(rotation @ up, [0, 1, 0])
     np.testing.assert_array_equal(rotation @ [1, 0, 0], [1, 0, 0])
     np.testing.assert_array_equal(rotation @ forward, [0, 0, -1])
-
-
-def test_the_table_has_every_axis_that_the_command_line_names() -> None:
-    assert len({tuple(Transform.from_up(axis).rotation.ravel()) for axis in UP_AXES}) == len(UP_AXES) == 4
 
 
 def test_parts_come_one_after_another() -> None:
@@ -324,21 +320,60 @@ MOVES = [
 @pytest.mark.parametrize("transform", MOVES)
 def test_a_camera_that_moves_along_sees_the_same_picture(transform: Transform) -> None:
     splats = scene()
-    before = picture(splats, Transform())
+    before, moved = picture(splats, Transform()), transform.apply(splats)
     assert before[..., 3].mean() > 0.2
-    assert psnr(before, picture(transform.apply(splats), transform)) > SAME
+    assert psnr(before, picture(moved, transform)) > SAME
+    assert psnr(before, picture(dataclasses.replace(moved, sh=splats.sh), transform)) < OTHER  # SH not rotated
 
 
-@pytest.mark.parametrize("transform", MOVES)
-def test_unrotated_spherical_harmonics_would_change_the_picture(transform: Transform) -> None:
-    splats = scene()
-    moved = dataclasses.replace(transform.apply(splats), sh=splats.sh)
-    assert psnr(picture(splats, Transform()), picture(moved, transform)) < OTHER
+# Places on the Earth
+
+DEGREES = st.floats(-89.9, 89.9)
 
 
-def test_covariances_of_the_library_follow_as_well() -> None:
-    splats, transform = random_splats(10), Transform.from_euler(90, 0, 0)
-    xx, xy, xz, yy, yz, zz = covariance(splats.scale, splats.quat_xyzw).T
-    moved = transform.apply(splats)
-    turned = np.stack([xx, -xz, xy, zz, -yz, yy], axis=1)  # y becomes z, and z becomes -y
-    np.testing.assert_allclose(covariance(moved.scale, moved.quat_xyzw), turned, atol=1e-6 * np.abs(turned).max())
+def matrix_of(*place: float) -> np.ndarray:
+    return np.array(earth_matrix(*place)).reshape(4, 4).T
+
+
+def position(latitude: float, longitude: float, height: float) -> np.ndarray:
+    """A point above the ellipsoid x^2/a^2 + y^2/a^2 + z^2/b^2 = 1, by the parametric latitude of its foot."""
+    a, b = RADIUS, RADIUS * (1 - FLATTENING)
+    phi, lam = math.radians(latitude), math.radians(longitude)
+    beta = math.atan2(b * math.sin(phi), a * math.cos(phi))
+    foot = np.array([a * math.cos(beta) * math.cos(lam), a * math.cos(beta) * math.sin(lam), b * math.sin(beta)])
+    normal = foot / [a * a, a * a, b * b]
+    return foot + height * normal / np.linalg.norm(normal)
+
+
+@given(DEGREES, st.floats(-180, 180), st.floats(-1000, 1e5), st.floats(0, 360))
+def test_the_axes_are_east_north_and_up_turned_by_the_heading(
+    latitude: float, longitude: float, height: float, heading: float
+) -> None:
+    matrix = matrix_of(latitude, longitude, height, heading)
+    np.testing.assert_allclose(matrix[:3, 3], position(latitude, longitude, height), atol=1e-6)
+    axes = matrix[:3, :3]
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1)
+    step = 1e-4  # degrees; differences of positions point to where numbers grow
+    here = position(latitude, longitude, height)
+    north = position(latitude + step, longitude, height) - here
+    east = position(latitude, longitude + step, height) - here
+    north, east = north / np.linalg.norm(north), east / np.linalg.norm(east)
+    turn = math.radians(heading)
+    np.testing.assert_allclose(axes[:, 1], math.cos(turn) * north + math.sin(turn) * east, atol=1e-5)
+    np.testing.assert_allclose(axes[:, 2], np.cross(east, north), atol=1e-5)
+
+
+@given(DEGREES, st.floats(-179.9, 179.9), st.floats(-1000, 1e6), st.floats(0.1, 359.9))
+def test_a_place_is_found_again(latitude: float, longitude: float, height: float, heading: float) -> None:
+    found = place_of(earth_matrix(latitude, longitude, height, heading))
+    assert (found.latitude, found.longitude) == pytest.approx((latitude, longitude), abs=1e-9)
+    assert (found.height, found.heading) == pytest.approx((height, heading), abs=1e-5)
+
+
+def test_poles_and_the_equator_have_their_matrices() -> None:
+    np.testing.assert_allclose(matrix_of(0, 0)[:3, 3], [RADIUS, 0, 0])
+    np.testing.assert_allclose(matrix_of(90, 0)[:3, 3], [0, 0, 6_356_752.314245], atol=1e-6)
+    np.testing.assert_allclose(matrix_of(0, 90)[:3, :3], [[-1, 0, 0], [0, 0, 1], [0, 1, 0]], atol=1e-15)
+    # Heading 90: the scene's forward axis, y, points east, and its right one south.
+    np.testing.assert_allclose(matrix_of(0, 0, 0, 90)[:3, :3], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-15)

@@ -1,14 +1,12 @@
-"""The formulas of splats, their areas and their merging, in float64."""
+"""The formulas of splats in float64: areas, rotations and covariances."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
-from sparklod_cli.model.gaussian import MAX_OPACITY, MIN_OPACITY, THOMSEN_P
-from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.gaussian import THOMSEN_P
 
 
 def ellipsoid_area(scale: np.ndarray) -> np.ndarray:
@@ -31,35 +29,3 @@ def covariance(scale: np.ndarray, quat_xyzw: np.ndarray) -> np.ndarray:
     """Returns the (..., 3, 3) covariances R S S^T R^T."""
     factor = rotation_matrix(quat_xyzw) * np.asarray(scale, np.float64)[..., None, :]
     return factor @ np.swapaxes(factor, -1, -2)
-
-
-@dataclass
-class Moments:
-    """The values that a merged splat must have."""
-
-    center: np.ndarray
-    covariance: np.ndarray
-    weight: float
-    rgb: np.ndarray
-    sh: np.ndarray
-
-
-def merge(splats: Splats) -> Moments:
-    """Merges splats by matching moments, with weights of opacity * area."""
-    weight = splats.opacity.astype(np.float64) * ellipsoid_area(splats.scale)
-    share = weight / weight.sum()
-    center = share @ splats.center.astype(np.float64)
-    offset = splats.center - center
-    spread = covariance(splats.scale, splats.quat_xyzw) + offset[:, :, None] * offset[:, None, :]
-    return Moments(
-        center,
-        np.tensordot(share, spread, 1),
-        weight.sum(),
-        share @ splats.rgb.astype(np.float64),
-        np.tensordot(share, splats.sh.astype(np.float64), 1),
-    )
-
-
-def opacity_of(weight: float, scale: np.ndarray) -> float:
-    """Returns the linear opacity of a merged splat of these scales."""
-    return float(np.clip(weight / ellipsoid_area(scale), MIN_OPACITY, MAX_OPACITY))

@@ -1,8 +1,12 @@
-"""Palettes by brute force: k-means as it is in books."""
+"""Palettes by brute force, k-means as it is in books; and rotations of SOG."""
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
+from sparklod_cli.codecs import quantize
+from sparklod_cli.codecs.sog_images import FIRST_TAG
 
 
 def distances(rows: np.ndarray, codes: np.ndarray) -> np.ndarray:
@@ -45,3 +49,12 @@ def halved(rows: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, tuple[floa
     parts = [(rows[part], weight[part]) for part in (~above, above)]
     errors = [squared_error(part, np.average(part, axis=0, weights=w)[None], w) for part, w in parts]
     return above == above[0], (errors[0], errors[1])
+
+
+def decode_quat(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(N, 4) bytes to (N, 4) unit quaternions x y z w; one without a tag gives NaN."""
+    others = [(codes[:, k].astype(np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5)) for k in range(3)]
+    tag = codes[:, 3]
+    quat = quantize.quat_of_others(tag.astype(np.int16) - FIRST_TAG, *others)[:, [1, 2, 3, 0]]
+    quat[tag < FIRST_TAG] = np.nan
+    return quat

@@ -21,8 +21,7 @@ from sparklod_cli.viewers.loaded_scene import TRAVERSED
 from sparklod_cli.viewers.scenes import Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
 from tests.conftest import FIXTURES
-from tests.lod.details import row_of_regions
-from tests.lod.forests import transform
+from tests.lod.trees import row_of_regions, transform
 from tests.part_files import write_streamed
 
 TOWN, HAND = FIXTURES / "traverse" / "town.spz", FIXTURES / "golden" / "hand-tree-v3.spz"

@@ -22,8 +22,7 @@ from sparklod_cli.viewers.loaded_scene import LoadedScene
 from sparklod_cli.viewers.playcanvas import LoadedDetail
 from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings
-from tests.lod.details import row_of_regions
-from tests.lod.forests import random_tree, transform
+from tests.lod.trees import random_tree, row_of_regions, transform
 from tests.references import frames as twin
 from tests.scenes import random_splats
 from tests.simulation.conftest import (

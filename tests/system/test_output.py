@@ -20,7 +20,7 @@ from sparklod_cli.system import output
 from sparklod_cli.system.errors import OutputError
 from sparklod_cli.system.output import Output, Siblings
 from tests.conftest import ROOT
-from tests.outputs import write_files
+from tests.scenes import write_files
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 

@@ -23,7 +23,7 @@ from sparklod_cli.render import renderer
 from sparklod_cli.render.rasterizer import Image, ShadedSplats
 from sparklod_cli.render.render_settings import RasterSettings
 from tests.conftest import FIXTURES, Capture
-from tests.lod.details import row_of_regions
+from tests.lod.trees import row_of_regions
 from tests.part_files import tiled, write_streamed
 from tests.scenes import random_splats
 

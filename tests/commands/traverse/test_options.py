@@ -17,7 +17,7 @@ from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from tests.commands.render.test_options import GIVEN as OF_RENDER
 from tests.conftest import FIXTURES, Capture
-from tests.lod.details import row_of_regions
+from tests.lod.trees import row_of_regions
 from tests.part_files import tiled, write_streamed
 from tests.scenes import random_splats
 
