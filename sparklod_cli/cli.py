@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib import import_module
 from typing import Any, NoReturn
 
 import click
 
 from . import __version__
-from .commands.command import Group
+from .commands.command import Command
 from .commands.console import Verbosity, say, say_error, say_usage_error
 from .system import interrupts, stdio
 from .system.errors import SparklodError, UnfitError, out_of_memory, reason_of
@@ -36,6 +37,35 @@ COMMANDS = {
     "help": "Print the help of a command.",
 }
 
+#: Modules of commands that have no module of their own name.
+MODULES = dict.fromkeys(("doctor", "warmup", "completion"), "installation")
+
+#: Names of commands in other tools, and the commands here.
+ALIASES = {
+    "bake": "build-lod",
+    "build": "build-lod",
+    "lod": "build-lod",
+    "unlod": "convert --leaves",
+    "transcode": "convert",
+    "export": "convert",
+    "decimate": "simplify",
+    "reduce": "simplify",
+    "check": "inspect",
+    "info": "inspect",
+    "report": "inspect",
+    "stats": "inspect",
+    "validate": "inspect",
+    "benchmark": "traverse",
+    "simulate": "traverse",
+    "compare": "render --compare",
+    "draw": "render",
+    "preview": "render",
+    "compile": "warmup",
+    "serve": "view",
+    "show": "view",
+    "open": "view",
+}
+
 #: Tasks and their commands, which can be run one after the other.
 TASKS = {
     "Bake a scene for the web": "sparklod build-lod scene.ply",
@@ -57,8 +87,8 @@ class _EndOfFileError(Exception):
     """Carries an `EOFError` past click, which takes it for Ctrl-D and says that a person interrupted."""
 
 
-class Sparklod(Group):
-    """The group of all commands."""
+class Sparklod(click.Group):
+    """The group of all commands, each imported when it is needed."""
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -66,10 +96,67 @@ class Sparklod(Group):
         except EOFError as error:
             raise _EndOfFileError from error
 
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        if cmd_name == help.name:
+            return help
+        name = cmd_name.replace("-", "_")
+        module = import_module(f".commands.{MODULES.get(name, name)}", __package__)
+        command: click.Command = getattr(module, name)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            raise click.UsageError(_unknown(args[0]), ctx)
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the lines of the commands, without loading one."""
+        with formatter.section("Commands"):
+            formatter.write_dl(list(COMMANDS.items()))
+
+
+def _unknown(name: str) -> str:
+    """Return the error for an unknown command, with the command that was probably meant, or all of them."""
+    if os.path.isfile(name):  # noqa: PTH113
+        import shlex  # needed after a mistake only
+
+        meant: str | None = f"build-lod {shlex.quote(name)}"
+    else:
+        import difflib  # which takes a millisecond
+
+        plain = name.lower().replace("_", "-")
+        names = [*COMMANDS, *ALIASES]
+        near = [plain] if plain in names else difflib.get_close_matches(plain, names, n=1, cutoff=0.7)
+        meant = next((each if each in COMMANDS else ALIASES[each] for each in near), None)
+    hint = f"did you mean {meant}?" if meant else f"the commands are {', '.join(COMMANDS)}"
+    return f"there is no command {name!r}; {hint}"
+
+
+@click.command("help", cls=Command)
+@click.argument("command", required=False)
+@click.pass_context
+def help(ctx: click.Context, command: str | None) -> None:
+    """Print the help of COMMAND, or of sparklod itself, as --help does."""
+    parent = ctx.find_root()
+    if command is None:
+        click.echo(parent.get_help())
+        return
+    named = cli.get_command(parent, command)
+    if named is None:
+        raise click.UsageError(_unknown(command), parent)
+    with named.make_context(command, [], parent=parent, resilient_parsing=True) as child:
+        click.echo(child.get_help())
+
 
 @click.group(
     cls=Sparklod,
-    rows=COMMANDS,
     epilog=EPILOG,
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"]},

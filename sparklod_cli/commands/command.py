@@ -1,4 +1,4 @@
-"""Commands with headings in `--help`, their options as fields of dataclasses, and the group that loads them lazily."""
+"""Commands with headings in `--help`, and their options as fields of dataclasses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import os
 import re
 import string
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -44,32 +43,6 @@ OTHER_OUTPUTS = {"html": (".html", ".htm"), "export": ("",)}
 
 #: Suffixes that inputs and outputs of build-lod and simplify may share.
 TREES = (".spz", ".rad")
-
-#: Names of commands in other tools, and the commands here.
-ALIASES = {
-    "bake": "build-lod",
-    "build": "build-lod",
-    "lod": "build-lod",
-    "unlod": "convert --leaves",
-    "transcode": "convert",
-    "export": "convert",
-    "decimate": "simplify",
-    "reduce": "simplify",
-    "check": "inspect",
-    "info": "inspect",
-    "report": "inspect",
-    "stats": "inspect",
-    "validate": "inspect",
-    "benchmark": "traverse",
-    "simulate": "traverse",
-    "compare": "render --compare",
-    "draw": "render",
-    "preview": "render",
-    "compile": "warmup",
-    "serve": "view",
-    "show": "view",
-    "open": "view",
-}
 
 
 class Option(click.Option):
@@ -228,76 +201,6 @@ def refuse_output_among_inputs(ctx: click.Context, *, missing: bool = False) -> 
     if last.suffix.lower() in alike and not missing:
         return  # a second input whose name is wrong
     raise click.UsageError(error.format(last, "-o", shlex.quote(str(last))), ctx)
-
-
-class Group(click.Group):
-    """A group of commands, each imported when it is needed.
-
-    Args:
-        rows: lines of `--help` by the name of the command. Its module in `commands`, and the function there, have
-            the same name, with _ for -.
-    """
-
-    def __init__(self, *arguments: Any, rows: dict[str, str], **attributes: Any) -> None:
-        super().__init__(*arguments, **attributes)
-        self.rows = rows
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self.rows)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in self.rows:
-            return None
-        if cmd_name == help.name:
-            return help
-        name = cmd_name.replace("-", "_")
-        command: click.Command = getattr(import_module(f".{name}", __package__), name)
-        return command
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args and args[0] not in self.rows and not args[0].startswith("-"):
-            raise click.UsageError(self.unknown(args[0]), ctx)
-        return super().resolve_command(ctx, args)
-
-    def unknown(self, name: str) -> str:
-        """Return the error for an unknown command, with the command that was probably meant, or all of them."""
-        if os.path.isfile(name):  # noqa: PTH113
-            import shlex  # needed after a mistake only
-
-            meant: str | None = f"build-lod {shlex.quote(name)}"
-        else:
-            import difflib  # which takes a millisecond
-
-            plain = name.lower().replace("_", "-")
-            names = [*self.rows, *ALIASES]
-            near = [plain] if plain in names else difflib.get_close_matches(plain, names, n=1, cutoff=0.7)
-            meant = next((each if each in self.rows else ALIASES[each] for each in near), None)
-        hint = f"did you mean {meant}?" if meant else f"the commands are {', '.join(self.rows)}"
-        return f"there is no command {name!r}; {hint}"
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the rows, without loading a command."""
-        with formatter.section("Commands"):
-            formatter.write_dl(list(self.rows.items()))
-
-
-@click.command("help", cls=Command)
-@click.argument("command", required=False)
-@click.pass_context
-def help(ctx: click.Context, command: str | None) -> None:
-    """Print the help of COMMAND, or of sparklod itself, as --help does."""
-    parent = ctx.parent
-    assert parent is not None and isinstance(parent.command, Group)
-    if command is None:
-        click.echo(parent.get_help())
-        return
-    named = parent.command.get_command(parent, command)
-    if named is None:
-        raise click.UsageError(parent.command.unknown(command), parent)
-    with named.make_context(command, [], parent=parent, resilient_parsing=True) as child:
-        click.echo(child.get_help())
 
 
 Options = TypeVar("Options")

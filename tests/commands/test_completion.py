@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.commands.completion import SHELLS
+from sparklod_cli.commands.installation import SHELLS
 from tests.conftest import ROOT, Capture
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.commands import doctor
-from sparklod_cli.commands.doctor import Check
+from sparklod_cli.commands import installation as doctor
+from sparklod_cli.commands.installation import Check
 from tests.conftest import ROOT, Capture
 
 FINE = Check("sparklod", "ok", "0.1.0")

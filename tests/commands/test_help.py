@@ -11,8 +11,8 @@ from pathlib import Path
 import click
 import pytest
 
-from sparklod_cli.cli import COMMANDS, TASKS, cli, run
-from sparklod_cli.commands.command import ALIASES, COMMON, FEW_EXAMPLES, GENERAL, Command
+from sparklod_cli.cli import ALIASES, COMMANDS, TASKS, cli, run
+from sparklod_cli.commands.command import COMMON, FEW_EXAMPLES, GENERAL, Command
 from tests.conftest import FIXTURES, ROOT, Capture
 
 COMMAND_NAMES = [name for name in COMMANDS if name != "help"]

@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli import warmup
-from sparklod_cli.commands import doctor
-from sparklod_cli.commands.doctor import Check, check_all
+from sparklod_cli.commands import installation as doctor
+from sparklod_cli.commands.installation import Check, check_all
 from sparklod_cli.render import opengl
 from sparklod_cli.system import jit, machine, packages
 from sparklod_cli.system.errors import CameraPathError, SparklodError, optional_import

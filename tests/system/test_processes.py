@@ -16,7 +16,7 @@ import pytest
 import sparklod_cli
 from sparklod_cli import cli
 from sparklod_cli.cli import run
-from sparklod_cli.commands import doctor
+from sparklod_cli.commands import installation as doctor
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.system.kernel_cache import SUFFIX
 from sparklod_cli.system.python_process import check_current_folder, module_command, program_command
@@ -315,7 +315,7 @@ def import_numba_without_forks() -> None:
 #: All that starts a process of Python, by the module that does.
 STARTED: dict[str, list[Callable[[], object]]] = {
     "bake/out_of_core/cluster": [start_workers],
-    "commands/doctor": [check_kernels, find_ffmpeg],
+    "commands/installation": [check_kernels, find_ffmpeg],
     "images/pyvista_scene": [probe_pyvista],
     "render/opengl": [probe_opengl],
     "render/open3d_backend": [start_open3d],
@@ -371,7 +371,7 @@ def test_every_process_of_python_is_started_in_this_way() -> None:
     calls = re.compile(r"\b(program_command|module_command|safe_path)\(")
     users = {name for name, text in texts.items() if calls.search(text)}
     assert users - {helper, "system/jit"} == set(STARTED)
-    shown = {"commands/completion", "commands/doctor", "system/packages"}  # its path, by which they start nothing
+    shown = {"commands/installation", "system/packages"}  # its path, by which they start nothing
     assert {name for name, text in texts.items() if "sys.executable" in text} == {helper, *shown}
 
 

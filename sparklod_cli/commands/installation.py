@@ -1,7 +1,7 @@
-"""`sparklod doctor`: what sparklod needs, whether it is here, and what to do where it is not.
+"""Commands about the installation: `sparklod doctor`, `sparklod warmup` and `sparklod completion`.
 
-The checks must work where nothing else does: packages are looked up by their metadata and tried in processes of their
-own, as a broken one may end its process instead of raising.
+The checks of doctor must work where nothing else does: packages are looked up by their metadata and tried in processes
+of their own, as a broken one may end its process instead of raising.
 """
 
 from __future__ import annotations
@@ -11,9 +11,12 @@ import dataclasses
 import json
 import os
 import platform
+import re
+import shlex
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
@@ -21,21 +24,24 @@ from pathlib import Path
 from typing import Any, Literal
 
 import click
+from click.shell_completion import get_completion_class
 
 from .. import __version__
 from ..system import machine
+from ..system.errors import SparklodError, reason_of
 from ..system.packages import DISTRIBUTION, install_hint, pip_install, required_by
 from ..system.python_process import program_command
+from ..system.setting_fields import setting, whole
 from ..system.threads import processors
 from ..system.untrusted import printable
 from .command import Command, flag, values_of
-from .console import Console, count_of, print_json
-from .option_groups import JSON, QUIET, VERBOSE
+from .console import Console, count_of, print_json, say
+from .option_groups import JSON, QUIET, VERBOSE, processors_to_use
 
 #: Beginning of the names of checks of extras.
 EXTRA = "extra "
 
-EXAMPLES = """\
+DOCTOR_EXAMPLES = """\
   sparklod doctor
   sparklod doctor --quiet || exit 1      # in CI
   sparklod doctor --json > doctor.json   # to attach to a report
@@ -49,7 +55,7 @@ class _Messages:
     verbose: bool = flag("Print what is being checked.", **VERBOSE)
 
 
-@click.command("doctor", cls=Command, options=_Messages, examples=EXAMPLES)
+@click.command("doctor", cls=Command, options=_Messages, examples=DOCTOR_EXAMPLES)
 @click.pass_context
 def doctor(ctx: click.Context, /, **_: Any) -> None:
     """Check the installation: packages, extras, OpenGL, compiled kernels, threads and memory.
@@ -350,3 +356,136 @@ def check_all(begun: Callable[[str], None] = lambda name: None) -> list[Check]:
             value = f"cannot be checked ({type(error).__name__}: {error})"
             found.append(Check(name, "note", value, "please report this, with what sparklod doctor --json prints"))
     return found
+
+
+WARMUP_EXAMPLES = """\
+  sparklod warmup                                # once, after pip install
+  RUN pip install ./sparklod && sparklod warmup  # in a Dockerfile
+  NUMBA_CACHE_DIR=.cache/numba sparklod warmup   # in CI, with a cached folder
+"""
+
+
+@dataclass(frozen=True)
+class _WarmupOptions:
+    as_json: bool = flag("Print one JSON object on standard output.", **JSON)
+    quiet: bool = flag("Print nothing but errors.", **QUIET)
+    verbose: bool = flag("Print which kernels are missing.", **VERBOSE)
+    jobs: int = setting(
+        "Number of processes to compile in.",
+        whole(1, 64),
+        lambda: min(processors_to_use(), 4),
+        show_default="processors, up to 4",
+    )
+
+
+@click.command("warmup", cls=Command, options=_WarmupOptions, examples=WARMUP_EXAMPLES)
+@click.pass_context
+def warmup(ctx: click.Context, /, **_: Any) -> None:
+    """Compile all kernels for this machine, so that no later command has to.
+
+    The inner loops of sparklod, its kernels, are compiled for the processor when they are first called. This command
+    compiles all of them at once and keeps them in the cache that later commands read: beside the package or, where that
+    is read-only, in your cache folder; NUMBA_CACHE_DIR names another one. Kernels that are in the cache stay there.
+    """
+    options = values_of(ctx, _WarmupOptions)
+    with Console(quiet=options.quiet, verbose=options.verbose) as console:
+        from ..system import jit
+        from ..warmup import missing, warm_up
+
+        for unit in missing():
+            console.detail(f"  {unit.name} must be compiled")
+        start = time.perf_counter()
+        compiled = warm_up(processes=options.jobs, progress=console.progress)
+        seconds = time.perf_counter() - start
+        folder = jit.CACHE_FOLDER or jit.READ_FOLDERS[0]
+        console.say(
+            f"compiled {count_of(compiled, 'kernel')} in {seconds:.1f} s, kept in {folder}"
+            if compiled
+            else f"all kernels are in {folder}"
+        )
+        if options.as_json:
+            print_json({"compiled": compiled, "seconds": round(seconds, 2), "cache": str(folder)})
+
+
+#: By shell, the variable of the folder with its settings, that folder below the home folder, the file in it, and the
+#: line that loads the script. It names the program by its path, which a virtual environment need not have on PATH. The
+#: folder completions of fish is not used, since fish reads it only for commands on PATH.
+SHELLS = {
+    "bash": ("", "", ".bashrc", '[ -x {program} ] && eval "$({program} completion bash)"'),
+    "zsh": (
+        "ZDOTDIR",
+        "",
+        ".zshrc",
+        "[ -x {program} ] && {{ (( $+functions[compdef] )) || {{ autoload -Uz compinit && compinit -i; }}; "
+        'eval "$({program} completion zsh)"; }}',
+    ),
+    "fish": (
+        "XDG_CONFIG_HOME",
+        ".config",
+        "fish/conf.d/sparklod.fish",
+        "test -x {program}; and {program} completion fish | source",
+    ),
+}
+
+#: Where the scripts of click run the program by the name that was typed, or by its own.
+CALLED = re.compile(r"(?<=_complete )((?:\S+=\(.*?\) )*)(?:\$1|sparklod)(?=\))")
+
+#: Where the script of click gives up as the program is not on PATH.
+GUARD = "(( ! $+commands[sparklod] )) && return 1"
+
+COMPLETION_EXAMPLES = """\
+  sparklod completion --install          # for the shell of $SHELL
+  eval "$(sparklod completion bash)"     # in this shell only
+"""
+
+
+@click.command("completion", cls=Command, examples=COMPLETION_EXAMPLES)
+@click.argument("shell", type=click.Choice(list(SHELLS)), required=False, metavar="[SHELL]")
+@click.option("--install", is_flag=True, help="Add a line that loads the script to the settings of the shell.")
+@click.pass_context
+def completion(ctx: click.Context, shell: str | None, install: bool) -> None:
+    """Print the script by which SHELL completes commands, options and file names.
+
+    SHELL is that of the variable SHELL unless it is given. bash must be 4.4 or newer; the script for zsh needs its
+    compinit, which --install calls if nothing has.
+    """
+    shell = shell or Path(os.environ.get("SHELL", "")).name
+    if shell not in SHELLS:
+        raise click.UsageError(f"the shell is not known from $SHELL; name one of {', '.join(SHELLS)}", ctx)
+    if install:
+        _install(shell)
+        return
+    kind = get_completion_class(shell)
+    assert kind is not None
+    script = kind(ctx.find_root().command, {}, "sparklod", "_SPARKLOD_COMPLETE").source()
+    program = _program(shell)
+    click.echo(CALLED.sub(lambda found: found[1] + program, script).replace(GUARD, ""))
+
+
+def _program(shell: str) -> str:
+    """Return the absolute path of the command sparklod, quoted for a shell."""
+    started, beside = Path(sys.argv[0]), Path(sys.executable).with_name("sparklod")
+    if started.name != beside.name:  # python -m sparklod_cli
+        started = beside if beside.is_file() else Path(shutil.which(beside.name) or beside)
+    path = os.path.abspath(shutil.which(started) or started)  # noqa: PTH100  # a link stays one: pipx moves its target
+    if shell == "fish":
+        return "'" + path.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    return shlex.quote(path)
+
+
+def _install(shell: str) -> None:
+    """Append the line that loads the script to the settings of a shell, unless they have it."""
+    variable, folder, name, line = SHELLS[shell]
+    line = line.format(program=_program(shell))
+    path = Path(os.environ.get(variable) or Path.home() / folder) / name
+    try:
+        before = path.read_text("utf-8", "surrogateescape") if path.exists() else ""
+        if line in before.splitlines():
+            say(f"{path} loads the completion already")
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a", encoding="utf-8") as file:
+            file.write("\n" * bool(before and not before.endswith("\n")) + line + "\n")
+    except OSError as error:
+        raise SparklodError(f"{path}: cannot be changed: {reason_of(error)}") from None
+    say(f"{path} loads the completion from the next shell on")
