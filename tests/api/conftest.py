@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 import sparklod_cli as sparklod
-from tests.api.runs import DEMO
+from tests.commands.cli import NAMED
+from tests.commands.conftest import cli as cli
 
 
 @pytest.fixture(scope="package")
 def scene() -> sparklod.Scene:
-    return sparklod.read(DEMO)
+    return sparklod.read(NAMED["demo.ply"])
 
 
 @pytest.fixture(scope="package")

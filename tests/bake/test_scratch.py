@@ -29,7 +29,7 @@ from sparklod_cli.system.addresses import Address, Place
 from sparklod_cli.system.errors import FormatError, ScratchError, UnreadableError
 from sparklod_cli.system.stdio import DASH
 from tests.conftest import IS_ROOT, ROOT
-from tests.faults.runs import mounted
+from tests.faults.test_faults import mounted
 
 DTYPES = st.sampled_from(["<f4", "<f8", "<i4", "<i8", "<u2", "<u8", "|u1", "|b1", "<f2"])
 SHAPES = arrays_of.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=6)

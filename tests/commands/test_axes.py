@@ -1,10 +1,12 @@
-"""One rule on the axis that points up: formats that specify it are taken at their word, and every command says so."""
+"""Which axis is up: specified by a format, named by --up, noted in outputs, and the same for all commands."""
 
 from __future__ import annotations
 
 import gzip
 import json
+import re
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -12,15 +14,26 @@ import pytest
 
 import sparklod_cli as sparklod
 from fixtures import by_hand_glb, by_hand_tiles
-from sparklod_cli.cli import COMMANDS, cli, run
+from sparklod_cli.api.viewing import prepare
+from sparklod_cli.cli import COMMANDS
+from sparklod_cli.cli import cli as program
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.model.scene import ASSUMED, SPECIFIED, Scene
+from sparklod_cli.images.metrics import psnr
+from sparklod_cli.io.reading import read_parts, read_scene
+from sparklod_cli.model.scene import ASSUMED, AXES, SPECIFIED, Scene
 from tests.codecs.cases import linear
-from tests.conftest import Capture
+from tests.commands.cli import NAMED, Cli
 
-#: What is told of a file, after its name.
+#: The note on a file, after its name.
 SENTENCE = "y is up, as {} specifies; if the scene is upside down, its converter kept y down: give --up -y"
+
+
+def up_of(path: Path | str) -> str | None:
+    return read_scene(Path(path)).up
+
+
+# --- Files of other writers -------------------------------------------------------------------------------------------
 
 
 def scene() -> Scene:
@@ -44,7 +57,7 @@ def encoded(version: int) -> bytes:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Files of the same coordinates, by sparklod and by others, whose axes their format specifies or nobody knows."""
+    """Files of the same coordinates by sparklod and by other writers, with specified and with unknown axes."""
     folder = tmp_path_factory.mktemp("axes")
     for version in (2, 3):
         (folder / f"others-{version}.spz").write_bytes(of_others(encoded(version)))
@@ -78,119 +91,220 @@ UNKNOWN = [
 ]
 
 
-def is_upright(path: Path, tmp_path: Path, *options: str) -> bool:
+def is_upright(cli: Cli, path: Path | str, options: str = "") -> bool:
     """Return whether the upper half of a picture of a file is red."""
-    output = tmp_path / "picture.npy"
-    assert run(["render", str(path), "-o", str(output), "--size", "40x40", "--full", "-f", *options]) == 0
-    image = np.load(output)
+    cli(f"render {path} -o picture.npy --size 40x40 --full -f {options}")
+    image = np.load("picture.npy")
     upper, lower = image[:20, :, :3].sum(axis=(0, 1)), image[20:, :, :3].sum(axis=(0, 1))
     assert (upper[0] > upper[2]) == (lower[0] < lower[2])
     return bool(upper[0] > upper[2])
 
 
-def told(capsys: Capture, *arguments: object) -> list[str]:
+def notes(cli: Cli, line: str) -> list[str]:
     """Return the lines of a command that are about axes; those of `inspect` are joined."""
-    capsys.readouterr()
-    assert run([*map(str, arguments)]) == 0
-    out, err = capsys.readouterr()
-    text = out if arguments[0] == "inspect" else err
-    lines = " ".join(text.split()).split("note ") if arguments[0] == "inspect" else text.splitlines()
+    done = cli(line)
+    inspects = line.startswith("inspect")
+    lines = " ".join(done.out.split()).split("note ") if inspects else done.err.splitlines()
     return [line for line in lines if "specifies" in line or "the files differ" in line]
 
 
 @pytest.mark.parametrize(("name", "form"), SPECIFYING.items())
-def test_every_command_says_the_same_of_an_axis_that_the_format_specifies(
-    name: str, form: str, folder: Path, tmp_path: Path, capsys: Capture
+def test_every_command_has_the_same_note_on_an_axis_that_the_format_specifies(
+    name: str, form: str, folder: Path, cli: Cli
 ) -> None:
     path, sentence = folder / name, SENTENCE.format(form)
-    commands: list[tuple[object, ...]] = [
-        ("render", path, "--size", "8x8", "-f", "-o", tmp_path / "x.png"),
-        ("view", path, "--export", tmp_path / "site", "-f"),
-        ("build-lod", path, "-f", "-o", tmp_path / "x.rad"),
-        ("build-lod", path, "-f", "-o", tmp_path / "y.rad", "--memory", "1G"),
-        ("simplify", path, "--to", "50%", "-f", "-o", tmp_path / "x.ply"),
+    lines = [
+        f"render {path} --size 8x8 -f -o x.png",
+        f"build-lod {path} -f -o x.rad",
+        f"build-lod {path} -f -o y.rad --memory 1G",
+        f"simplify {path} --to 50% -f -o x.ply",
     ]
     if name.endswith("tileset.json"):
-        commands[1:2] = [("traverse", path, "--orbit", "2", "-f", "-o", tmp_path / "x.csv")]
-    elif name == "others-4.spz":
-        del commands[1]  # no viewer of a page reads it
-    for command in commands:
-        (line,) = told(capsys, *command)
-        assert line.endswith(sentence), command
-        assert told(capsys, *command, "--up", "-y") == [], command
-    (line,) = told(capsys, "inspect", path)
-    assert line.startswith(sentence)
-    assert is_upright(path, tmp_path) and not is_upright(path, tmp_path, "--up", "-y")
+        lines.append(f"traverse {path} --orbit 2 -f -o x.csv")
+    elif name != "others-4.spz":  # which no viewer of a page reads
+        lines.append(f"view {path} --export site -f")
+    for line in lines:
+        (note,) = notes(cli, line)
+        assert note.endswith(sentence), line
+        assert notes(cli, f"{line} --up -y") == [], line
+    (note,) = notes(cli, f"inspect {path}")
+    assert note.startswith(sentence)
+    assert is_upright(cli, path) and not is_upright(cli, path, "--up -y")
 
 
 @pytest.mark.parametrize("name", UNKNOWN)
-def test_an_axis_that_nobody_knows_is_assumed_and_not_noted(
-    name: str, folder: Path, tmp_path: Path, capsys: Capture
-) -> None:
+def test_an_unknown_axis_is_assumed_without_a_note(name: str, folder: Path, cli: Cli) -> None:
     path = folder / name
-    assert sparklod.read(path).up is None
-    assert (
-        told(capsys, "render", path, "--size", "8x8", "-o", tmp_path / "x.png") == told(capsys, "inspect", path) == []
-    )
-    assert not is_upright(path, tmp_path)
-    assert is_upright(path, tmp_path, "--up", "y")
-    assert ASSUMED == "-y" and set(SPECIFIED.values()) == {"y"}
+    assert up_of(path) is None and ASSUMED == "-y" and set(SPECIFIED.values()) == {"y"}
+    assert notes(cli, f"render {path} --size 8x8 -o x.png") == notes(cli, f"inspect {path}") == []
+    assert is_upright(cli, path, "--up y") and not is_upright(cli, path)
 
 
 @pytest.mark.parametrize("name", ["others-3.spz", "others.glb"])
 @pytest.mark.parametrize(
     "output", ["x.spz", "x.rad", "x/lod-meta.json", "x/tileset.json", "x.ply", "x.sog", "x.glb", "small.spz"]
 )
-def test_an_axis_that_a_format_specifies_is_noted_in_the_output(
-    name: str, output: str, folder: Path, tmp_path: Path, capsys: Capture
-) -> None:
-    target = tmp_path / output
-    trees = target.suffix in (".rad", ".json") or output == "x.spz"
-    command = ["build-lod"] if trees else ["simplify", "--to", "50%"]
-    assert run([*command, str(folder / name), "-o", str(target)]) == 0
-    capsys.readouterr()
-    assert run(["inspect", str(target), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
+def test_a_specified_axis_is_noted_in_the_output(name: str, output: str, folder: Path, cli: Cli) -> None:
+    command = "build-lod" if output.endswith((".rad", ".json", "x.spz")) else "simplify --to 50%"
+    cli(f"{command} {folder / name} -o {output}")
+    report = cli(f"inspect {output} --json").json
     assert (report["up"], report["up_by"]) == ("y", "")
-    assert told(capsys, "render", target, "--size", "8x8", "-o", tmp_path / "x.png") == []
-    assert is_upright(target, tmp_path)
+    assert notes(cli, f"render {output} --size 8x8 -o x.png") == [] and is_upright(cli, output)
 
 
-@pytest.mark.parametrize("way", ["convert", "simplify"])
-def test_a_plain_spz_of_sparklod_has_the_axes_of_what_it_was_made_from(way: str, folder: Path, tmp_path: Path) -> None:
-    target, tree = tmp_path / "x.spz", folder / "tree.rad"
-    options = [str(target), "--leaves"] if way == "convert" else ["--to", "90%", "-o", str(target)]
-    assert run([way, str(tree), *options]) == 0
-    assert sparklod.read(target).up is None
-    assert not is_upright(target, tmp_path)
+def test_files_that_differ_are_noted(folder: Path, cli: Cli) -> None:
+    pair, differing = (
+        f"{folder}/others-3.spz {folder}/plain.ply",
+        "the files differ in the axis that is up (y, unknown), so",
+    )
+    lines = notes(cli, f"render {pair} --size 8x8 -o x.png")
+    assert lines == [f"others-3.spz: {SENTENCE.format('SPZ')}", f"{differing} {ASSUMED} is taken; --up chooses"]
+    for files, note, up in (
+        (pair, f"  {differing} none is noted unless --up names it", None),
+        (f"{folder}/others-3.spz {folder}/others-2.spz", f"  {SENTENCE.format('SPZ')}", "y"),
+    ):
+        assert notes(cli, f"build-lod {files} --merge -o x.rad -f") == [note]
+        assert up_of("x.rad") == up
+    cli(f"build-lod {pair} --merge --up -y -o x.rad -f")
+    assert up_of("x.rad") == "y"
 
 
-def test_files_that_differ_are_told(folder: Path, tmp_path: Path, capsys: Capture) -> None:
-    pair = folder / "others-3.spz", folder / "plain.ply"
-    lines = told(capsys, "render", *pair, "--size", "8x8", "-o", tmp_path / "x.png")
-    differing = "the files differ in the axis that is up (y, unknown), so "
-    assert lines == [f"others-3.spz: {SENTENCE.format('SPZ')}", f"{differing}{ASSUMED} is taken; --up chooses"]
-    lines = told(capsys, "build-lod", *pair, "--merge", "-o", tmp_path / "x.rad")
-    assert lines == [f"  {differing}none is noted unless --up names it"]
-    assert sparklod.read(tmp_path / "x.rad").up is None
-    (line,) = told(capsys, "build-lod", pair[0], folder / "others-2.spz", "--merge", "-o", tmp_path / "y.rad")
-    assert line == f"  {SENTENCE.format('SPZ')}"
-    assert sparklod.read(tmp_path / "y.rad").up == "y"
-
-
-def test_an_instance_that_is_turned_has_another_axis(folder: Path, tmp_path: Path, capsys: Capture) -> None:
-    instances = {"instances": [{"file": str(folder / "others-3.spz"), "rotation": [1, 0, 0, 0]}]}
-    (tmp_path / "town.json").write_text(json.dumps(instances))
-    assert told(capsys, "render", "--scene", tmp_path / "town.json", "--size", "8x8", "-o", tmp_path / "x.png") == []
-    assert told(capsys, "build-lod", "--scene", tmp_path / "town.json", "-o", tmp_path / "x.rad") == []
-    assert sparklod.read(tmp_path / "x.rad").up == "-y"
+def test_a_turned_instance_has_another_axis(folder: Path, cli: Cli) -> None:
+    cli.put("town.json", json.dumps({"instances": [{"file": f"{folder}/others-3.spz", "rotation": [1, 0, 0, 0]}]}))
+    assert notes(cli, "render --scene town.json --size 8x8 -o x.png") == []
+    assert notes(cli, "build-lod --scene town.json -o x.rad") == []
+    assert up_of("x.rad") == "-y"
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_up_is_in_the_short_help_of_every_command_that_has_it(name: str, capsys: Capture) -> None:
-    command = cli.get_command(click.Context(cli), name)
+def test_up_is_in_the_short_help_of_every_command_that_has_it(name: str, cli: Cli) -> None:
+    command = program.get_command(click.Context(program), name)
     assert command is not None
-    assert run([name, "--help"]) == 0
     has_it = any(parameter.name == "up" for parameter in command.params)
     assert has_it == (name in ("build-lod", "convert", "simplify", "render", "traverse", "view"))
-    assert (" --up " in capsys.readouterr().out) == has_it
+    assert (" --up " in cli(f"{name} --help").out) == has_it
+
+
+# --- Outputs of sparklod ----------------------------------------------------------------------------------------------
+
+#: Outputs in every format of trees, turned so that y is up, and their options.
+TURNED = {
+    "x.spz": "",
+    "x.rad": "",
+    "chunked.rad": "--format rad-chunked",
+    "web/lod-meta.json": "--method quick --levels 30%",
+}
+
+
+@pytest.fixture
+def turned(cli: Cli) -> Cli:
+    cli("build-lod sh3.ply -o x.spz --up -y -q")
+    return cli
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TURNED)
+def test_a_picture_of_the_turned_scene_is_that_of_the_scene(name: str, cli: Cli) -> None:
+    cli(f"build-lod demo.ply -o {name} --up -y -q {TURNED[name]}")
+    how, look = "--size 120x90 --full -q -f", "--look-at 0,2,6:0,0,0"
+    images = []
+    for line in ("demo.ply", name, f"{name} --up=-y", f"{name} {look}", f"{name} {look} --up=y"):
+        cli(f"render {line} {how} -o x.npy")
+        images.append(np.load("x.npy"))
+    before, after, on_its_head, noted, named = images
+    assert psnr(before, after) > max(35, psnr(before, on_its_head) + 15)
+    np.testing.assert_array_equal(noted, named)
+    assert cli(f"inspect {name} --json").json["up"] == "y" and "y is up" in cli(f"inspect {name}").out
+    if name.endswith(".json"):
+        assert read_parts(Path("web")).up == "y"
+        return
+    options: dict[str, Any] = {"served": True, "threads": 1}
+    for up, expected in ((None, [0, 1, 0]), ((0.0, -1.0, 0.0), [0, -1, 0])):  # on a page
+        page = prepare([Path(name)], **options, **({"up": up} if up else {})).resources["view.json"]
+        assert isinstance(page, bytes) and json.loads(page)["up"] == expected
+
+
+def test_orbits_go_around_the_axis_that_is_up(turned: Cli) -> None:
+    line = "traverse x.spz --orbit 3 --elevation 40 --budget 500 --json"
+    noted, given, other = (
+        turned(f"{line} {up}").json["quantities"]["projected_px_p95"] for up in ("", "--up=y", "--up=-y")
+    )
+    assert noted == given != other
+    tree = sparklod.read("x.spz")
+    around = [camera.position for camera in sparklod.orbit(tree, count=3, elevation=40.0)]
+    expected = [camera.position for camera in sparklod.orbit(tree, count=3, elevation=40.0, up=(0.0, 1.0, 0.0))]
+    np.testing.assert_array_equal(around, expected)
+    assert all(position[1] > tree.splats.center[:, 1].mean() for position in around)
+    half_turn = {"file": "x.spz", "rotation": [1, 0, 0, 0], "name": "turned"}
+    for instances in ([half_turn], [half_turn, {"file": "x.spz", "name": "not turned"}]):
+        turned.put("scene.json", json.dumps({"instances": instances}))
+        (camera,) = sparklod.orbit(sparklod.read_instances("scene.json"), count=1, elevation=60.0).cameras
+        assert camera.camera_to_world[1, 1] < 0  # y is down, or no axis is up in both, as training leaves scenes
+
+
+@pytest.mark.parametrize("suffix", ["spz", "rad"])
+def test_without_up_no_axis_is_noted(suffix: str, cli: Cli) -> None:
+    for options in ("", "--rotate 90,0,0", "--translate 1,2,3"):
+        cli(f"build-lod sh2.ply -o x.{suffix} -f {options}")
+        assert b'"up"' not in Path(f"x.{suffix}").read_bytes()[:4096]
+        assert cli(f"inspect x.{suffix} --json").json["up"] is None
+
+
+@pytest.mark.parametrize(
+    ("options", "up"),
+    [
+        ("--up y", "y"),
+        ("--up z", "y"),
+        ("--up -y --rotate 5,-70,3", "y"),  # levelled
+        ("--up y --rotate 90,0,0", "z"),
+        ("--up -z --rotate 0,0,-90 --scale 2", "x"),
+    ],
+)
+def test_the_axis_turns_with_the_scene(options: str, up: str, cli: Cli) -> None:
+    cli(f"build-lod sh2.ply -o x.rad {options}")
+    assert up_of("x.rad") == up
+
+
+def test_every_output_has_the_axis_of_its_input(turned: Cli) -> None:
+    for line, up in (
+        *(("build-lod x.spz -o a.rad", "y"), ("build-lod x.spz -o b.rad --format rad-chunked", "y")),
+        *(("build-lod x.spz -o c.rad --refine 2", "y"), ("build-lod a.rad -o d.spz", "y")),
+        *((f"convert a.rad --leaves {name}", "y") for name in ("e.ply", "f.sog", "g.spz", "h.rad", "web/meta.json")),
+        *(("build-lod e.ply -o i.spz", "y"), ("build-lod f.sog -o j.rad --rotate -90,0,0", "-z")),
+        *(("build-lod e.ply h.rad --merge -o k.spz", "y"), ("build-lod e.ply sh2.ply --merge -o l.spz", None)),
+    ):
+        turned(line)
+        name = next(word for word in reversed(line.split()) if "." in word and not word.startswith("-"))
+        assert up_of(name) == up, line
+    err = turned("convert a.rad x.splat").err
+    assert re.search("y is up, which this format cannot note; give --up=y to render", err)
+    assert "--up" not in turned("convert a.rad x.ply").err
+
+
+def test_leaves_of_an_unknown_axis_keep_it(folder: Path, cli: Cli) -> None:
+    for line in ("convert {} x.spz --leaves", "simplify {} --to 90% -o x.spz -f"):
+        cli(line.format(folder / "tree.rad"))
+        assert up_of("x.spz") is None and not is_upright(cli, "x.spz")
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_every_axis_can_be_noted(name: str, tmp_path: Path) -> None:
+    scene = Scene(read_scene(NAMED["sh2.ply"]).splats, up=name)
+    for suffix in (".spz", ".rad", ".ply", ".sog"):
+        sparklod.write(tmp_path / f"x{suffix}", scene)
+        again = read_scene(tmp_path / f"x{suffix}")
+        (camera,) = sparklod.orbit(again, count=1).cameras
+        assert again.up == name and camera.camera_to_world[:3, 1] @ AXES[name] > 0
+    with pytest.raises(ValueError, match=r"up is 'Y'; give one of x, -x, y"):
+        Scene(scene.splats, up="Y")
+
+
+@pytest.mark.parametrize("name", ["x.spz", "x.rad"])
+def test_a_wrong_axis_is_a_finding_and_ignored(name: str, cli: Cli) -> None:
+    cli(f"build-lod sh2.ply -o {name} --up -y")
+    data = Path(name).read_bytes()
+    assert data.count(b'"up": "y"' if name == "x.spz" else b'\\"up\\": \\"y\\"') == 1
+    Path(name).write_bytes(data.replace(b'\\"y\\"', b'\\"q\\"').replace(b'"up": "y"', b'"up": "q"'))
+    report = cli(f"inspect {name} --check --json").json
+    assert report["up"] is None and any("up axis" in finding["message"] for finding in report["findings"])
+    cli(f"render {name} -o x.png --size 9x9")

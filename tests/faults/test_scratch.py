@@ -22,7 +22,7 @@ from sparklod_cli.bake.out_of_core.store import Store
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.bake.skipping import bake_unless_there
 from sparklod_cli.system.errors import InvalidSplatsError, OutputError, ScratchError
-from tests.faults.runs import DEMO, ENVIRONMENT, mounted
+from tests.faults.test_faults import DEMO, ENVIRONMENT, mounted
 from tests.signals import heed_signals
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="there is no kill -9 on Windows")]
@@ -42,16 +42,13 @@ from sparklod_cli.system import interrupts
 source, target, scratch, method, suffix, moment, how = sys.argv[1:]
 left, encode = int(moment), store.encode
 
-def end():
-    if how == "kill":
-        os.kill(os.getpid(), signal.SIGKILL)
-    print("waits", flush=True)
-    time.sleep(60)
-
 def halfway(pieces):
     for number, piece in enumerate(pieces):
         if number == 2:
-            end()
+            if how == "kill":
+                os.kill(os.getpid(), signal.SIGKILL)
+            print("waits", flush=True)
+            time.sleep(60)
         yield piece
 
 def failing(arrays):
@@ -177,15 +174,6 @@ def test_a_bake_whose_output_is_in_place_is_resumed(
     assert not (tmp_path / f"out.rad{SUFFIX}").exists()
 
 
-def test_a_file_that_an_interrupted_bake_did_not_write_is_not_replaced(tmp_path: Path) -> None:
-    target, scratch = tmp_path / "out.rad", tmp_path / "scratch"
-    begun(target, scratch, "quick", 23, "kill").communicate()
-    target.write_bytes(b"mine")
-    with pytest.raises(OutputError, match=r"out\.rad exists, add --overwrite"):
-        baked(target, scratch, resume=True)
-    assert target.read_bytes() == b"mine"
-
-
 def test_results_that_somebody_removed_are_an_error_that_says_what_helps(
     tmp_path: Path, whole: dict[tuple[str, str], bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -202,12 +190,16 @@ def test_results_that_somebody_removed_are_an_error_that_says_what_helps(
     assert target.read_bytes() == whole["quick", ".rad"]
 
 
-def test_leftover_results_are_refused_or_removed_by_a_bake_in_memory_too(tmp_path: Path) -> None:
+def test_leftover_results_are_refused_or_removed_and_no_file_of_others_is_replaced(tmp_path: Path) -> None:
     target = tmp_path / "out.rad"
-    begun(target, tmp_path, "quick", 12, "kill").communicate()
+    begun(target, tmp_path, "quick", 23, "kill").communicate()
     settings, resources = BakeSettings(suffix=".rad"), Resources(scratch_dir=tmp_path)
     with pytest.raises(ScratchError, match="an interrupted bake left"):
-        bake(DEMO, target, settings, resources=resources)
+        bake(DEMO, target, settings, resources=resources)  # in memory
+    target.write_bytes(b"mine")
+    with pytest.raises(OutputError, match=r"out\.rad exists, add --overwrite"):
+        baked(target, tmp_path, resume=True)
+    assert target.read_bytes() == b"mine"
     assert bake(DEMO, target, settings, resources=resources, overwrite=True).blocks is None
     assert [path.name for path in tmp_path.iterdir()] == ["out.rad"]
 
