@@ -13,7 +13,7 @@ import pytest
 import sparklod_cli as sparklod
 from sparklod_cli.tables.columns import Column, Row
 from tests.commands.cli import NAMED, Cli
-from tests.lod.details import row_of_regions
+from tests.lod.trees import row_of_regions
 from tests.part_files import write_streamed
 
 pytestmark = pytest.mark.slow

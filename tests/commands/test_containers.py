@@ -18,7 +18,7 @@ from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.scene import Scene
 from tests.commands.cli import NAMED, Cli
-from tests.lod.details import row_of_regions
+from tests.lod.trees import row_of_regions
 from tests.part_files import write_streamed
 from tests.scenes import random_splats
 

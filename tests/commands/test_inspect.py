@@ -16,7 +16,7 @@ from PIL import Image
 from sparklod_cli.api import inspect_jobs
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import WriteOptions
-from sparklod_cli.images import pyvista_scene, tree_plot
+from sparklod_cli.images import pyvista_scene, scene_plots
 from sparklod_cli.inspection.expectations import FORMATS, NAMES
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.model.lod_tree import LodTree
@@ -176,8 +176,8 @@ def test_no_name_ends_an_annotation_or_begins_a_command(cli: Cli, monkeypatch: p
 
 
 def test_the_paths_of_page_and_picture_are_printed(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
-    picture = tree_plot.DescribedPicture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
-    monkeypatch.setattr(tree_plot, "plot", lambda *_, **__: picture)
+    picture = scene_plots.DescribedPicture(b"\x89PNG" * 100, "all leaves: 6 nodes; coloured by level")
+    monkeypatch.setattr(scene_plots, "plot", lambda *_, **__: picture)
     monkeypatch.setattr(pyvista_scene, "load_pyvista", lambda: None)  # which may be missing
     done = cli(f"inspect {TREE} --plot a.png --html a.html")
     size = (cli.folder / "a.html").stat().st_size / 1e3

@@ -30,7 +30,7 @@ from sparklod_cli.render.render_settings import RasterSettings, RenderSettings
 from sparklod_cli.system.setting_fields import CheckedSettings, Range, Setting, setting, settings_in
 from sparklod_cli.viewers.viewer_settings import DetailRule, LodSettings, Network, StreamingSettings
 from tests.commands.cli import Cli
-from tests.lod.details import row_of_regions
+from tests.lod.trees import row_of_regions
 from tests.part_files import tiled, write_streamed
 from tests.scenes import random_splats
 

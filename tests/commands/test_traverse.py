@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sparklod_cli.images import charts
+from sparklod_cli.images import charts, scene_plots
 from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.simulation.results import COLUMNS, LOADING
 from tests.commands.cli import NAMED, Cli
@@ -272,9 +272,9 @@ def test_a_plot_is_a_picture(cli: Cli) -> None:
 def test_a_plot_shows_the_splats_of_its_frame(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     """Over a slow network few chunks are resident; the picture is of the splats drawn with these."""
     pytest.importorskip("matplotlib", reason="charts need the extra `render`")
-    shown: list[charts.PathScene] = []
+    shown: list[scene_plots.PathScene] = []
 
-    def drawn(rows: object, marked: object, title: str, scene: charts.PathScene) -> tuple[bytes, str | None]:
+    def drawn(rows: object, marked: object, title: str, scene: scene_plots.PathScene) -> tuple[bytes, str | None]:
         shown.append(scene)
         return b"a plot", None
 
