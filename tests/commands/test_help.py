@@ -22,9 +22,8 @@ from sparklod_cli.cli import ALIASES, BLAS_THREADS, COMMANDS, TASKS
 from sparklod_cli.cli import cli as program
 from sparklod_cli.commands import installation as doctor
 from sparklod_cli.commands.command import COMMON, FEW_EXAMPLES, GENERAL, Command
-from sparklod_cli.commands.installation import SHELLS
 from sparklod_cli.commands.console import JSON_VERSION
-from sparklod_cli.commands.installation import Check
+from sparklod_cli.commands.installation import SHELLS, Check
 from sparklod_cli.inspection.report import SCHEMA_VERSION
 from tests.commands.cli import Cli, process
 from tests.conftest import ROOT
