@@ -25,11 +25,10 @@ from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.threads import processors
-from sparklod_cli.viewers import cut as viewer_cut
-from sparklod_cli.viewers.chunk_cache import Chunks
-from sparklod_cli.viewers.cut import TreeCut
-from sparklod_cli.viewers.network import ChunkStream
+from sparklod_cli.viewers.loaded_scene import TreeCut
+from sparklod_cli.viewers.loaded_scene import Viewer as PackageViewer
 from sparklod_cli.viewers.scenes import Scenes, read_scenes
+from sparklod_cli.viewers.streaming import Chunks, ChunkStream
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, pixel_limit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -116,7 +115,7 @@ class Viewer:
     """A viewer of a file: Spark's cuts, and a stream of its chunks."""
 
     scenes: Scenes
-    traversal: viewer_cut.Viewer
+    traversal: PackageViewer
 
     @classmethod
     def of(cls, path: Path) -> Viewer:

@@ -30,7 +30,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.simulation.frames import Changes, measure
 from sparklod_cli.system.threads import on_threads, ordered_map, processors
 from sparklod_cli.viewers.continuous import ContinuousCuts
-from sparklod_cli.viewers.cut import Forest, TreeInstance
+from sparklod_cli.viewers.loaded_scene import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 
 #: Nodes of the trees of tiled scenes in millions, budgets in nodes, and frames of their path.

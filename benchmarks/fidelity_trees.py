@@ -127,7 +127,7 @@ def _bake_in_blocks(source: Source, file: Path) -> None:
 def _refined(source: Source) -> sparklod.Tree:
     """Return a tree of our quality builder whose merged splats are fitted to pictures of the scene."""
     from sparklod_cli.fitting.fit import fit
-    from sparklod_cli.fitting.settings import FitSettings
+    from sparklod_cli.fitting.fit_settings import FitSettings
     from sparklod_cli.system.threads import processors
 
     tree = sparklod.build_lod(source.drawn, method="quality", growth=source.growth)

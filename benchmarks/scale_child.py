@@ -21,7 +21,7 @@ from typing import Any
 
 def record_tasks(tasks: list[dict[str, Any]]) -> None:
     """Has the engine of this process note how long each task takes; those of a round wait for all of the one before."""
-    from sparklod_cli.bake.out_of_core.job import LocalEngine
+    from sparklod_cli.bake.job import LocalEngine
 
     run, rounds = LocalEngine.run, itertools.count()
 

@@ -40,8 +40,8 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .codecs.rad.rad_header import RadHeader as RadHeader
     from .codecs.rad.rad_writer import RadChunk as RadChunk
     from .codecs.spark_codings import SplatEncoding as SplatEncoding
-    from .fitting.settings import FitSettings as FitSettings
-    from .fitting.settings import Refined as Refined
+    from .fitting.fit_settings import FitSettings as FitSettings
+    from .fitting.fit_settings import Refined as Refined
     from .inspection.report import Report as Report
     from .lod.tree_settings import DetailSettings as DetailSettings
     from .model.foveation import Cones as Cones

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.fitting import fit as fitting
-from sparklod_cli.fitting.settings import SHARES, FitSettings, FitStage, Refined
+from sparklod_cli.fitting.fit_settings import SHARES, FitSettings, FitStage, Refined
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
 

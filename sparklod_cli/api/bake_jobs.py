@@ -76,7 +76,7 @@ def bake_files(
     with contextlib.ExitStack() as stack:
         outcomes: Iterator[Any] = itertools.repeat(LARGE)
         if scheduler is not None or workers is not None:
-            from ..bake.out_of_core.cluster import bake_side_by_side, cluster
+            from ..bake.cluster import bake_side_by_side, cluster
 
             engine = stack.enter_context(
                 cluster(scheduler, workers=workers or 1, threads=cluster_threads, memory=memory, say=say)

@@ -48,7 +48,7 @@ def draw_files(
 
     settings = None if budget is None else dataclasses.replace(lod, budget=scenes.splats_of(budget))
     if loading is not None and settings is not None and scenes.with_cuts:
-        from ..simulation.loading import Loader
+        from ..simulation.frames import Loader
 
         source: CutFinder = Loader(scenes, settings, *loading)
     else:
@@ -94,7 +94,7 @@ def traverse_files(
         outputs.check_frames(cameras.numbers, len(scenes.instances))
     loading = None
     if not streaming.network.instant:
-        from ..simulation.loading import Loader
+        from ..simulation.frames import Loader
 
         loading = Loader(scenes, settings, streaming).load(cameras.cameras[0])
     rows, in_front, note = write_frames(

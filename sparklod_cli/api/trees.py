@@ -12,7 +12,7 @@ from ..cameras.camera import Camera
 from ..cameras.sources import CameraPath
 from ..codecs.reader import check_valid
 from ..fitting import STEPS
-from ..fitting.settings import FitSettings, Refined
+from ..fitting.fit_settings import FitSettings, Refined
 from ..lod.tree_settings import (
     BUILDERS,
     DEFAULT_BASE,

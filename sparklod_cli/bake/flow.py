@@ -26,7 +26,7 @@ from .settings import Baked, BakeSettings, Resources
 from .tree_output import output_of, write_whole, write_windows
 
 if TYPE_CHECKING:
-    from .out_of_core.job import Engine
+    from .job import Engine
 
 #: Suffix of scratch folders.
 SCRATCH = ".sparklod-scratch"
@@ -78,7 +78,7 @@ def bake(
         opened = stack.enter_context(contextlib.ExitStack())
         reader = opened.enter_context(open_reader(source, threads=threads))
         if not reader.has_tree and _may_need_blocks(reader, source, target, settings, resources, engine):
-            from .out_of_core.planning import blocks_for
+            from .planning import blocks_for
 
             blocks = stack.enter_context(
                 blocks_for(
@@ -126,8 +126,8 @@ def bake(
 
 def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:
     """Return whether the bake to be resumed was interrupted when all or part of its output may have been in place."""
-    from .out_of_core.job import PUBLISHED
-    from .out_of_core.store import Store
+    from .job import PUBLISHED
+    from .store import Store
 
     return Store(scratch_folder(source, target, settings, resources.scratch_dir)).has(PUBLISHED)
 

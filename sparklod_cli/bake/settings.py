@@ -15,7 +15,7 @@ from ..model.selection import Selection
 
 if TYPE_CHECKING:
     from ..codecs.losses import Clamp
-    from ..fitting.settings import FitSettings, Refined
+    from ..fitting.fit_settings import FitSettings, Refined
     from ..lod.tree_settings import DetailSettings, TileSettings
     from ..model.transforms import Transform
     from ..system.addresses import Place

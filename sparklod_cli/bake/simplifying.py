@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..codecs.formats import Format
 from ..codecs.losses import Losses, settled_with_losses
 from ..codecs.options import WriteOptions
-from ..fitting.settings import FitSettings, Refined
+from ..fitting.fit_settings import FitSettings, Refined
 from ..io.writing import encoded, write_scene
 from ..model.falloff import MIN_ALPHA
 from ..model.scene import Scene

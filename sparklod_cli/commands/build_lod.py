@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from ..bake.converting import Converted
     from ..bake.settings import Baked, Source
     from ..codecs.losses import Clamp, Losses
-    from ..fitting.settings import Refined
+    from ..fitting.fit_settings import Refined
     from ..model.instances import Instance
 
 EXAMPLES = """\
@@ -293,7 +293,7 @@ class BuildLodOptions:
         """Return the settings of bakes; loads numpy."""
         refine = None
         if self.refine is not None:
-            from ..fitting.settings import FitSettings
+            from ..fitting.fit_settings import FitSettings
 
             refine = FitSettings(self.refine or None, self.seed, device=self.device)
         form = target.form

@@ -12,7 +12,7 @@ import click
 from ..codecs.formats import WRITABLE
 from ..codecs.options import WriteOptions
 from ..fitting import STEPS
-from ..fitting.settings import FitSettings
+from ..fitting.fit_settings import FitSettings
 from ..lod.budget import Budget, doubt, parse_budget
 from ..lod.tree_settings import DETAIL_GROWTH
 from ..system.addresses import Place

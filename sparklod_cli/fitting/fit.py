@@ -17,6 +17,7 @@ from ..system.errors import BackendError
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads
 from ..system.units import percent_of
+from .fit_settings import FitSettings, FitStage, Refined
 from .kernels.adam import Rates
 from .pictures import (
     HELD_OUT,
@@ -36,7 +37,6 @@ from .pictures import (
     scores_of,
     split_path,
 )
-from .settings import FitSettings, FitStage, Refined
 
 #: Stages, after each of which held-out cameras decide.
 STAGES = 12

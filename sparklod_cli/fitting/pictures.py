@@ -25,13 +25,12 @@ from ..render import gradients, rasterizer
 from ..render.kernels.shade import add_sh
 from ..render.rasterizer import Image, ShadedSplats, draw
 from ..render.render_settings import RasterSettings
-from ..viewers.cut import Forest, TreeInstance
-from ..viewers.loaded_scene import nodes_of
+from ..viewers.loaded_scene import Forest, TreeInstance, nodes_of
 from ..viewers.spark import SparkViewer
+from .fit_settings import SHARES
 from .kernels import adam
 from .kernels.adam import MOST_D, Columns, FitBounds
 from .kernels.view import by_image, mark_seen, squared_differences
-from .settings import SHARES
 
 Index = NDArray[np.int64]
 

@@ -1,4 +1,4 @@
-"""`Simulation`: the frames of a viewer along a camera path, what is measured of their cuts, and their outputs."""
+"""`Simulation`, the frames of a viewer along a camera path; and `Loader`, visitors who wait while a page loads."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +20,11 @@ from ..system.output import write_file
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..tables.columns import Filter, Row
-from ..viewers.chunk_cache import ChunkCache, Chunks
-from ..viewers.cut import Forest, TreeCut, TreeInstance, Viewer
-from ..viewers.loaded_scene import STREAMED_SOG, TILES, TREE
-from ..viewers.scenes import CutFinder, Scenes
+from ..viewers.loaded_scene import STREAMED_SOG, TILES, TREE, Forest, TreeCut, TreeInstance, Viewer
+from ..viewers.scenes import Cut, CutFinder, Scenes
+from ..viewers.streaming import ChunkCache, Chunks, ChunkStream
 from ..viewers.viewer_settings import LodSettings, StreamingSettings, pixel_limit
-from .results import COLUMNS, OF_BUDGETS, OF_TREES, Extremes, FrameOutputs, Moment, add_extremes, moments_of
-
-if TYPE_CHECKING:
-    from ..viewers.network import ChunkStream
+from .results import COLUMNS, LOADING, OF_BUDGETS, OF_TREES, Extremes, FrameOutputs, Moment, add_extremes, moments_of
 
 
 class StreamedCuts(CutFinder):
@@ -97,8 +92,6 @@ class Simulation(StreamedCuts):
         """
         cache, stream = ChunkCache(self.chunks, self.streaming.chunk_cache), None
         if not self.streaming.network.instant:
-            from ..viewers.network import ChunkStream
-
             start, network = path.cameras[0].time, self.streaming.network
             stream = ChunkStream(self.chunks, network, capacity=self.streaming.chunk_cache, start=start)
             cache = stream.cache
@@ -258,7 +251,6 @@ def _charts(
 ) -> tuple[bytes, str | None]:
     """Return the charts, with the path over the cut of an extreme frame, and why that picture is missing, if it is."""
     from ..images import charts, scene_plots
-    from ..viewers.loaded_scene import TREE
 
     frames = [extremes[criterion] for criterion in (*(moment.criterion for moment in moments), "first")]
     # The first that draws anything, as none does before the first chunk has arrived.
@@ -385,3 +377,87 @@ class Changes:
         self._drawn, self._before = self._before, self._drawn
         self._last, self._counts = (cut.node, cut.instance), found[:, 0].tolist()
         return result
+
+
+#: The share of a cut that makes a picture almost what it will be; chosen.
+MOST = 0.9
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """State when a chunk has arrived.
+
+    Attributes:
+        seconds: since the page was opened.
+        bytes: that have arrived so far, of headers too.
+        share: 0..1 of the splats of the whole cut that are resident.
+        resident: (chunks,) bool, of all trees.
+    """
+
+    seconds: float
+    bytes: int
+    share: float
+    resident: NDArray[np.bool_]
+
+
+class Loader(StreamedCuts):
+    """Visitors who open a page with scenes, each in front of a camera, and wait; see `StreamedCuts`.
+
+    Args:
+        seconds: since they opened the page, for `cut`.
+    """
+
+    def __init__(
+        self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings | None = None, seconds: float = 0.0
+    ) -> None:
+        super().__init__(scenes, settings, streaming)
+        self.seconds = seconds
+
+    def arrivals(self, camera: Camera) -> Iterator[Arrival]:
+        """Yield the state at the beginning and after each arrival of a chunk, as long as any are wanted.
+
+        The camera rests. As soon as a chunk has arrived, the viewer finds the cut again, with the chunks that it has;
+        Spark does so with the next picture that it draws.
+        """
+        per_chunk = self._splats_of(self.find(camera))
+        total = max(1, int(per_chunk.sum()))
+        stream = ChunkStream(self.chunks, self.streaming.network, capacity=self.streaming.chunk_cache)
+        stream.want([])
+        while True:
+            resident = stream.cache.resident()
+            yield Arrival(stream.now, stream.received, float(per_chunk[resident].sum()) / total, resident)
+            stream.want(self.find(camera, resident).wanted())
+            while not stream.take_arrivals():
+                if not stream.step():
+                    return
+
+    def load(self, camera: Camera) -> Row:
+        """Return the waits, `LOADING`, of a visitor who stays at a camera; None if a cut never fits the cache."""
+        figures: Row = dict.fromkeys(column.name for column in LOADING)
+        for arrival in self.arrivals(camera):
+            if figures["first_picture_s"] is None and self.chunks.shows(arrival.resident):
+                figures["first_picture_s"] = arrival.seconds
+            for name, share in (("resident_90", MOST), ("resident_all", 1)):
+                if figures[f"{name}_s"] is None and arrival.share >= share:
+                    figures[f"{name}_s"], figures[f"{name}_bytes"] = arrival.seconds, arrival.bytes
+            if arrival.share == 1:
+                break
+        return {column.name: column.rounded(figures[column.name]) for column in LOADING}
+
+    def cut(self, camera: Camera) -> Cut:
+        """Return what a visitor sees after `seconds`."""
+        resident = np.zeros(len(self.chunks.sizes), np.bool_)
+        for arrival in self.arrivals(camera):
+            if arrival.seconds > self.seconds:
+                break
+            resident = arrival.resident
+        return self.scenes.cut_of(self.find(camera, resident))
+
+    def _splats_of(self, cut: TreeCut) -> NDArray[np.int64]:
+        """Return the (chunks,) numbers of splats of a cut in each chunk of all trees."""
+        counts = np.zeros(len(self.chunks.sizes), np.int64)
+        scenes = [loaded for loaded in self.scenes.of_instance if loaded.kind is not None]
+        for loaded, view, nodes in zip(scenes, cut.views, cut.indices(), strict=True):
+            chunks, splats = np.unique(loaded.chunk_of(nodes.astype(np.int64)) - loaded.first_chunk, return_counts=True)
+            counts[int(view["chunk_base"]) + chunks] += splats
+        return counts

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..lod.parts import PIXEL_ERROR
 from ..model.scene import TileScene
-from .cut import Forest, TreeCut, TreeInstance
-from .loaded_scene import TILES, Index, LoadedScene, bytes_of, cut_of_runs
+from .loaded_scene import TILES, Forest, Index, LoadedScene, TreeCut, TreeInstance, bytes_of, cut_of_runs
 from .viewer_settings import CESIUM_FETCHERS
 
 #: Corners of a box, as shares of its extent.

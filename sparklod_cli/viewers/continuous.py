@@ -34,7 +34,7 @@ from ..lod.kernels.pixel_scale import pixel_scales
 from ..lod.kernels.tree_links import find_depths, find_limits, find_parents
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.splats import FloatArray
-from .cut import Viewer, views_of
+from .loaded_scene import Viewer, views_of
 from .viewer_settings import BLEND
 
 #: Bisections of the threshold's interval, whose ends differ by a factor of the width; 40 leave a share of 1e-12 of it.

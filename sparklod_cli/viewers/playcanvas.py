@@ -23,8 +23,7 @@ from ..codecs.streamed_sog import layout_of
 from ..io.opening import opened
 from ..model.scene import DetailScene
 from ..system.errors import FormatError
-from .cut import Forest, TreeCut, TreeInstance
-from .loaded_scene import STREAMED_SOG, Index, LoadedScene, bytes_of, cut_of_runs
+from .loaded_scene import STREAMED_SOG, Forest, Index, LoadedScene, TreeCut, TreeInstance, bytes_of, cut_of_runs
 from .viewer_settings import CONNECTIONS, LEAST_BASE_DISTANCE, PLAYCANVAS_FETCHERS, DetailRule
 
 Levels = NDArray[np.int64]

@@ -30,8 +30,20 @@ from ..system.errors import FormatError, InvalidSplatsError, TreeError, UnfitErr
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from ..system.units import count_of
-from .cut import Forest, TreeCut, TreeInstance, Viewer
-from .loaded_scene import STREAMED_SOG, TILES, TREE, UNNAMED, Index, LoadedScene, bytes_of, nodes_of
+from .loaded_scene import (
+    STREAMED_SOG,
+    TILES,
+    TREE,
+    UNNAMED,
+    Forest,
+    Index,
+    LoadedScene,
+    TreeCut,
+    TreeInstance,
+    Viewer,
+    bytes_of,
+    nodes_of,
+)
 from .spark import SparkViewer
 from .viewer_settings import PLAYCANVAS_BUDGET, LodSettings
 

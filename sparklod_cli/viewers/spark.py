@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..lod.kernels import cut
 from ..lod.kernels.cut import find_cut
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES
-from .cut import Forest, TreeCut, TreeInstance, views_of
+from .loaded_scene import Forest, TreeCut, TreeInstance, views_of
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
@@ -132,23 +132,3 @@ class SparkViewer:
     def forget(self) -> None:
         """Discard the threshold of this thread's last cut. The next cut is the same either way."""
         self._memory.guess = 0.0
-
-
-#: How many bytes Spark's pager asks for at first, then if they do not hold the whole header of a file.
-HEADER_REQUESTS = (64 << 10, 256 << 10, 1 << 20)
-
-
-def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
-    """Return the sizes of the answers that Spark's pager waits for before it can ask for a chunk of a file.
-
-    It does not know how long the header is, so it asks for the beginning of the file, and for more of it as long as the
-    header is not whole. What it gets of the first chunk along with it is thrown away.
-
-    Args:
-        header_bytes: of the header; 0 where the format has none that a viewer would need.
-    """
-    answers: list[int] = []
-    for request in HEADER_REQUESTS:
-        if (answers[-1] if answers else 0) < header_bytes:
-            answers.append(min(request, file_bytes))
-    return tuple(answers)

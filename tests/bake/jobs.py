@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from sparklod_cli.bake.out_of_core.job import Task
-from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.job import Task
+from sparklod_cli.bake.store import Store
 from sparklod_cli.codecs.merging import copy_rows
 from sparklod_cli.codecs.reader import Reader, Target
 from sparklod_cli.model.scene import Scene

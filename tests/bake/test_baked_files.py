@@ -36,7 +36,7 @@ from sparklod_cli.codecs.options import RadOptions, SogOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad_options
 from sparklod_cli.codecs.spark_codings import log_scale_table
 from sparklod_cli.codecs.statistics import Statistics
-from sparklod_cli.fitting.settings import FitSettings
+from sparklod_cli.fitting.fit_settings import FitSettings
 from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
 from sparklod_cli.inspection.report import ReportSettings, inspect

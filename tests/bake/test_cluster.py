@@ -28,12 +28,12 @@ import dask
 import distributed
 import psutil
 
+from sparklod_cli.bake import cluster as module
+from sparklod_cli.bake.cluster import ClusterEngine, cluster
 from sparklod_cli.bake.flow import bake
-from sparklod_cli.bake.out_of_core import cluster as module
-from sparklod_cli.bake.out_of_core.cluster import ClusterEngine, cluster
-from sparklod_cli.bake.out_of_core.job import Engine, Task
-from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.job import Engine, Task
 from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
+from sparklod_cli.bake.store import Store
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import RAD_SUFFIX as RAD
 from sparklod_cli.system.addresses import Address, Place

@@ -21,14 +21,14 @@ from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.fitting import fit, pictures
-from sparklod_cli.fitting.settings import SHARES, FitSettings
+from sparklod_cli.fitting.fit_settings import SHARES, FitSettings
 from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
 from sparklod_cli.system.errors import CameraPathError, FormatError, InvalidSplatsError, OutOfMemoryError, OutputError
 from sparklod_cli.system.output import write_file
-from sparklod_cli.viewers.cut import Forest, TreeInstance
+from sparklod_cli.viewers.loaded_scene import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from tests.conftest import FIXTURES
 from tests.fittings import StandIn

@@ -14,18 +14,17 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.bake import estimate
+from sparklod_cli.bake import estimate, order, store
+from sparklod_cli.bake.cluster import bake_side_by_side
 from sparklod_cli.bake.flow import bake
-from sparklod_cli.bake.out_of_core import order, store
-from sparklod_cli.bake.out_of_core.cluster import bake_side_by_side
-from sparklod_cli.bake.out_of_core.in_blocks import InBlocks
-from sparklod_cli.bake.out_of_core.job import Job, LocalEngine, Task, cut_into_blocks
-from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.in_blocks import InBlocks
+from sparklod_cli.bake.job import Job, LocalEngine, Task, cut_into_blocks
 from sparklod_cli.bake.settings import LARGE, Baked, BakeSettings, Resources
+from sparklod_cli.bake.store import Store
 from sparklod_cli.bake.tree_output import BuiltTree
 from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.statistics import ALL
-from sparklod_cli.fitting.settings import FitSettings
+from sparklod_cli.fitting.fit_settings import FitSettings
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import chunk_order, quick
 from sparklod_cli.lod.tree_settings import METHODS, bytes_of

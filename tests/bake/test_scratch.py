@@ -19,12 +19,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
+from sparklod_cli.bake import store as store_module
 from sparklod_cli.bake.flow import SCRATCH, scratch_folder
 from sparklod_cli.bake.identity import BakeIdentity, FileState
-from sparklod_cli.bake.out_of_core import store as store_module
-from sparklod_cli.bake.out_of_core.planning import LOCK, MANIFEST, at_work
-from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.planning import LOCK, MANIFEST, at_work
 from sparklod_cli.bake.settings import BakeSettings
+from sparklod_cli.bake.store import Store
 from sparklod_cli.system.addresses import Address, Place
 from sparklod_cli.system.errors import FormatError, ScratchError, UnreadableError
 from sparklod_cli.system.stdio import DASH
@@ -363,7 +363,7 @@ HOLDER = """
 import sys
 from pathlib import Path
 from typing import Any
-from sparklod_cli.bake.out_of_core.planning import locked
+from sparklod_cli.bake.planning import locked
 with locked(Path(sys.argv[1])):
     print("at work", flush=True)
     sys.stdin.read()

@@ -21,7 +21,7 @@ from sparklod_cli.cli import COMMANDS
 from sparklod_cli.cli import cli as program
 from sparklod_cli.codecs.options import RadOptions, SogOptions, WriteOptions
 from sparklod_cli.commands.command import Option
-from sparklod_cli.fitting.settings import FitSettings
+from sparklod_cli.fitting.fit_settings import FitSettings
 from sparklod_cli.images import charts
 from sparklod_cli.lod.tree_settings import DetailSettings, TileSettings
 from sparklod_cli.render import renderer

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import pytest
 
+from sparklod_cli.bake import planning
 from sparklod_cli.bake.flow import SCRATCH as SUFFIX
 from sparklod_cli.bake.flow import bake
-from sparklod_cli.bake.out_of_core import planning
-from sparklod_cli.bake.out_of_core.job import PUBLISHED
-from sparklod_cli.bake.out_of_core.store import Store
+from sparklod_cli.bake.job import PUBLISHED
 from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.bake.skipping import bake_unless_there
+from sparklod_cli.bake.store import Store
 from sparklod_cli.system.errors import InvalidSplatsError, OutputError, ScratchError
 from tests.faults.test_faults import DEMO, ENVIRONMENT, mounted
 from tests.signals import heed_signals
@@ -36,7 +36,7 @@ import os, signal, sys, time
 from pathlib import Path
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import BakeSettings, Resources
-from sparklod_cli.bake.out_of_core import store
+from sparklod_cli.bake import store
 from sparklod_cli.system import interrupts
 
 source, target, scratch, method, suffix, moment, how = sys.argv[1:]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.fitting.fit import RATES, fit
+from sparklod_cli.fitting.fit_settings import FitSettings
 from sparklod_cli.fitting.pictures import FittedNodes, FittedSet, Optimiser, Place, pictures, placed
-from sparklod_cli.fitting.settings import FitSettings
 from sparklod_cli.lod import quality
 from sparklod_cli.render.render_settings import RasterSettings
 from tests.cards import MARKS

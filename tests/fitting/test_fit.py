@@ -15,9 +15,9 @@ from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.fitting import fit as fit_module
 from sparklod_cli.fitting.fit import AHEAD, LAST, RATES, STAGES, Schedule, default_steps, fit
+from sparklod_cli.fitting.fit_settings import SHARES, FitSettings, Refined
 from sparklod_cli.fitting.kernels.adam import Rates
 from sparklod_cli.fitting.pictures import FittedNodes, FullDetailPicture, Index, Optimiser, Place, pictures, scores_of
-from sparklod_cli.fitting.settings import SHARES, FitSettings, Refined
 from sparklod_cli.inspection.tree import examine
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality, quick

@@ -10,6 +10,7 @@ import pytest
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.fitting.fit import RATES
+from sparklod_cli.fitting.fit_settings import SHARES
 from sparklod_cli.fitting.kernels.adam import MOST_D, Rates
 from sparklod_cli.fitting.pictures import (
     DISTANCES,
@@ -27,7 +28,6 @@ from sparklod_cli.fitting.pictures import (
     smaller,
     split_path,
 )
-from sparklod_cli.fitting.settings import SHARES
 from sparklod_cli.inspection.tree import examine
 from sparklod_cli.lod import quality
 from sparklod_cli.render.rasterizer import draw

@@ -18,7 +18,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import draw, shade
 from sparklod_cli.render.render_settings import RasterSettings
-from sparklod_cli.viewers.cut import Forest, TreeInstance
+from sparklod_cli.viewers.loaded_scene import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.interop.node import Node

@@ -29,8 +29,7 @@ from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.simulation.frames import Simulation
-from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance, views_of
-from sparklod_cli.viewers.loaded_scene import nodes_of
+from sparklod_cli.viewers.loaded_scene import Forest, TreeCut, TreeInstance, nodes_of, views_of
 from sparklod_cli.viewers.scenes import read_scenes
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings, pixel_limit

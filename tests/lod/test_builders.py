@@ -36,7 +36,7 @@ from sparklod_cli.render.rasterizer import Image, draw, shade
 from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.system.errors import InvalidSplatsError
 from sparklod_cli.system.progress import silent
-from sparklod_cli.viewers.cut import Forest, TreeInstance
+from sparklod_cli.viewers.loaded_scene import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from tests.conftest import real_scene
 from tests.lod.trees import (

@@ -21,7 +21,7 @@ from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree, Nodes
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.threads import on_threads
-from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance
+from sparklod_cli.viewers.loaded_scene import Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.lod.trees import CutView, check_threads, check_tree, children, links, parents, same, sorted_rows

@@ -15,7 +15,7 @@ from sparklod_cli.lod.kernels.pixel_scale import pixel_scales
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.viewers.continuous import BlendedCut, ContinuousCuts, faded, find_threshold, shares
-from sparklod_cli.viewers.cut import Forest, TreeInstance
+from sparklod_cli.viewers.loaded_scene import Forest, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from tests.lod.trees import Case, CutView, cases, children, drawn, random_tree, transform, view_from
 from tests.references import cuts as references

@@ -17,7 +17,7 @@ from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
 from sparklod_cli.simulation.frames import Changes, CutStatistics, measure
 from sparklod_cli.viewers import spark
-from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance, views_of
+from sparklod_cli.viewers.loaded_scene import Forest, TreeCut, TreeInstance, views_of
 from sparklod_cli.viewers.spark import VISITS
 from sparklod_cli.viewers.viewer_settings import pixel_limit
 from tests.lod.trees import (

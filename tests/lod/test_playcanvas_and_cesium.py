@@ -23,7 +23,7 @@ from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene, TileScene
 from sparklod_cli.viewers import cesium
 from sparklod_cli.viewers.cesium import CesiumViewer, LoadedTiles
-from sparklod_cli.viewers.cut import Forest, TreeInstance
+from sparklod_cli.viewers.loaded_scene import Forest, TreeInstance
 from sparklod_cli.viewers.playcanvas import (
     ANOTHER_LEVEL,
     ENVIRONMENT,

@@ -22,7 +22,7 @@ from sparklod_cli.model.scene import DetailScene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.progress import silent
 from sparklod_cli.system.threads import on_threads
-from sparklod_cli.viewers.cut import Forest, TreeCut, TreeInstance
+from sparklod_cli.viewers.loaded_scene import Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from tests.references import cuts as references
 from tests.references import gaussians

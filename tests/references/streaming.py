@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
-from sparklod_cli.viewers.chunk_cache import Chunks
+from sparklod_cli.viewers.streaming import Chunks
 from sparklod_cli.viewers.viewer_settings import Network
 
 #: Seconds; of two events nearer than this, rounding decides which comes first.

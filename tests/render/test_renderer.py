@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import sparklod_cli as sparklod
 from sparklod_cli.cli import run
-from sparklod_cli.fitting.settings import FitSettings
+from sparklod_cli.fitting.fit_settings import FitSettings
 from sparklod_cli.render.color_scales import nice_step, ticks
 from sparklod_cli.render.cuda.card import card_errors, on_card
 from sparklod_cli.render.rasterizer import draw, shade

@@ -17,8 +17,7 @@ from sparklod_cli.model.scene import Scene
 from sparklod_cli.simulation.frames import Simulation
 from sparklod_cli.simulation.results import COLUMNS, OF_TREES
 from sparklod_cli.tables.columns import Row
-from sparklod_cli.viewers.cut import Forest
-from sparklod_cli.viewers.loaded_scene import LoadedScene
+from sparklod_cli.viewers.loaded_scene import Forest, LoadedScene
 from sparklod_cli.viewers.playcanvas import LoadedDetail
 from sparklod_cli.viewers.scenes import CutFinder, Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings, Network, StreamingSettings

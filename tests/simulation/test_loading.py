@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.simulation.loading import Loader
+from sparklod_cli.simulation.frames import Loader
 from sparklod_cli.simulation.results import LOADING
 from sparklod_cli.viewers.playcanvas import LoadedDetail
 from sparklod_cli.viewers.scenes import Cut, CutFinder, Scenes

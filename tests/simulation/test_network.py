@@ -11,9 +11,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.viewers.chunk_cache import ChunkCache, Chunks
-from sparklod_cli.viewers.network import ChunkStream
-from sparklod_cli.viewers.spark import header_answers
+from sparklod_cli.viewers.loaded_scene import header_answers
+from sparklod_cli.viewers.streaming import ChunkCache, Chunks, ChunkStream
 from sparklod_cli.viewers.viewer_settings import Network
 from tests.references.streaming import NaiveCache, Twin, roots_first, sized
 

@@ -300,7 +300,7 @@ def start_warmup() -> None:
 
 def start_workers() -> None:
     pytest.importorskip("distributed")
-    from sparklod_cli.bake.out_of_core.cluster import cluster
+    from sparklod_cli.bake.cluster import cluster
 
     with cluster(workers=1, threads=1):
         pass
@@ -314,7 +314,7 @@ def import_numba_without_forks() -> None:
 
 #: All that starts a process of Python, by the module that does.
 STARTED: dict[str, list[Callable[[], object]]] = {
-    "bake/out_of_core/cluster": [start_workers],
+    "bake/cluster": [start_workers],
     "commands/installation": [check_kernels, find_ffmpeg],
     "images/pyvista_scene": [probe_pyvista],
     "render/opengl": [probe_opengl],

@@ -15,23 +15,23 @@ from pathlib import Path
 
 import numpy as np
 
-from ...codecs.reader import Reader
-from ...io.reading import Source, absolute_source, open_reader
-from ...system.addresses import Place, absolute
-from ...system.errors import FormatError, InvalidSplatsError, OutOfMemoryError, ScratchError, UnreadableError, reason_of
-from ...system.output import HAS_LOCKS, created, lock
-from ...system.progress import Progress
-from ...system.stdio import name_of
-from ...system.threads import ordered_map
-from ...system.units import count_of, format_size
-from ...system.untrusted import parse_json
-from .. import estimate
-from ..identity import BakeIdentity
-from ..settings import BakeSettings, Resources
-from ..tree_output import BuiltTree
+from ..codecs.reader import Reader
+from ..io.reading import Source, absolute_source, open_reader
+from ..system.addresses import Place, absolute
+from ..system.errors import FormatError, InvalidSplatsError, OutOfMemoryError, ScratchError, UnreadableError, reason_of
+from ..system.output import HAS_LOCKS, created, lock
+from ..system.progress import Progress
+from ..system.stdio import name_of
+from ..system.threads import ordered_map
+from ..system.units import count_of, format_size
+from ..system.untrusted import parse_json
+from . import estimate
+from .identity import BakeIdentity
 from .in_blocks import InBlocks
 from .job import Engine, Job, LocalEngine, forget
+from .settings import BakeSettings, Resources
 from .store import Store
+from .tree_output import BuiltTree
 
 #: Folder in the scratch folder for the unpacked input.
 UNPACKED = "input"

@@ -13,19 +13,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs.reader import Reader
-from ...codecs.statistics import Statistics
-from ...lod.stages import INVISIBLE, NO_FAMILY, Bounds, Pending
-from ...lod.tree_settings import BUILDERS
-from ...model.selection import REASONS, SelectionTally
-from ...model.sh import width_of
-from ...model.splats import FloatArray, Splats
-from ...system.errors import InvalidSplatsError
-from ...system.progress import Progress
-from ...system.threads import blocks_of, on_threads
-from ..in_memory import check_transformed, select, transform
-from ..settings import BakeSettings
-from ..tree_output import BuiltTree
+from ..codecs.reader import Reader
+from ..codecs.statistics import Statistics
+from ..lod.stages import INVISIBLE, NO_FAMILY, Bounds, Pending
+from ..lod.tree_settings import BUILDERS
+from ..model.selection import REASONS, SelectionTally
+from ..model.sh import width_of
+from ..model.splats import FloatArray, Splats
+from ..system.errors import InvalidSplatsError
+from ..system.progress import Progress
+from ..system.threads import blocks_of, on_threads
+from .in_memory import check_transformed, select, transform
 from .job import (
     ORDER,
     PUBLISHED,
@@ -41,10 +39,12 @@ from .job import (
     stage_of,
 )
 from .order import WINDOW_NODES, Rows, encode, encoded_array, fill_rows, node_stream, put_order, rows_of, splats_of
+from .settings import BakeSettings
 from .store import Arrays
+from .tree_output import BuiltTree
 
 if TYPE_CHECKING:
-    from ...codecs.encoder import Encoder, Windows
+    from ..codecs.encoder import Encoder, Windows
 
 #: Largest size of a block, as a multiple of the requested one; a scene with a larger block is divided again. Chosen.
 SLACK = 1.3

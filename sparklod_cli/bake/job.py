@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs.reader import Reader
-from ...lod.stages import Region, StagedBuilder
-from ...model.splats import FloatArray
-from ...system import machine
-from ...system.progress import Progress, silent
-from ...system.threads import ordered_map
-from ..settings import BakeSettings
+from ..codecs.reader import Reader
+from ..lod.stages import Region, StagedBuilder
+from ..model.splats import FloatArray
+from ..system import machine
+from ..system.progress import Progress, silent
+from ..system.threads import ordered_map
+from .settings import BakeSettings
 from .store import Store
 
 if TYPE_CHECKING:
-    from ...codecs.encoder import Encoder
+    from ..codecs.encoder import Encoder
 
 #: The most regions that are joined at once: those of three splits.
 CHILDREN = 8
@@ -216,7 +216,7 @@ class Job:
 
     def builder(self) -> StagedBuilder:
         """Return the builder of the tree."""
-        builder: StagedBuilder = import_module(f"...lod.{self.settings.method}", __package__)
+        builder: StagedBuilder = import_module(f"..lod.{self.settings.method}", __package__)
         return builder
 
     def part(self, number: int) -> str:

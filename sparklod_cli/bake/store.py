@@ -24,9 +24,9 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from ...system.addresses import Address, Place
-from ...system.errors import ScratchError, reason_of
-from ...system.output import write_atomically
+from ..system.addresses import Address, Place
+from ..system.errors import ScratchError, reason_of
+from ..system.output import write_atomically
 
 #: Arrays of a result by name, empty or of any shape.
 Arrays = Mapping[str, NDArray[Any]]

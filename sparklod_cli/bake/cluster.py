@@ -27,17 +27,17 @@ from typing import Any
 
 import numpy as np
 
-from ... import __version__
-from ...io.reading import Source, absolute_source, open_reader, places_of
-from ...system import machine
-from ...system.addresses import Place, absolute
-from ...system.errors import FormatError, OutOfMemoryError, SparklodError, memory_errors_translated, optional_import
-from ...system.progress import Progress, silent
-from ...system.python_process import check_current_folder, safe_path
-from ...system.threads import thread_count
-from ..estimate import default_memory, in_memory_bytes
-from ..settings import LARGE, Baked, BakeSettings, Resources
+from .. import __version__
+from ..io.reading import Source, absolute_source, open_reader, places_of
+from ..system import machine
+from ..system.addresses import Place, absolute
+from ..system.errors import FormatError, OutOfMemoryError, SparklodError, memory_errors_translated, optional_import
+from ..system.progress import Progress, silent
+from ..system.python_process import check_current_folder, safe_path
+from ..system.threads import thread_count
+from .estimate import default_memory, in_memory_bytes
 from .job import Task
+from .settings import LARGE, Baked, BakeSettings, Resources
 from .store import Store
 
 _INSTALL = f"install sparklod {__version__} with its extra cluster there, and start it again"
@@ -557,7 +557,7 @@ def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
                 dashboard_address=None,
                 memory_limit=_memory_limit(workers, memory),
                 env={"NUMBA_NUM_THREADS": str(threads)},
-                preload=["sparklod_cli.bake.out_of_core.cluster"],
+                preload=["sparklod_cli.bake.cluster"],
                 scheduler_kwargs={"allowed_failures": LOSSES},
                 silence_logs=SILENT,
             )

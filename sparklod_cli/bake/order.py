@@ -11,17 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...codecs.encoder import windows_of
-from ...lod.chunk_order import MOST_FAMILIES, band_order, family_order
-from ...lod.kernels.tree_links import find_limits
-from ...lod.stages import NO_FAMILY, STAGE_BITS
-from ...lod.tree_settings import BUILDERS
-from ...model.lod_tree import CHUNK_NODES, LodTree, NodeStream
-from ...model.scene import rotated_axis
-from ...model.sh import degree_of, width_of
-from ...model.splats import COLUMNS, FloatArray, Splats
-from ...system.progress import Progress
-from ...system.threads import blocks_of, for_blocks, on_threads, ordered_map
+from ..codecs.encoder import windows_of
+from ..lod.chunk_order import MOST_FAMILIES, band_order, family_order
+from ..lod.kernels.tree_links import find_limits
+from ..lod.stages import NO_FAMILY, STAGE_BITS
+from ..lod.tree_settings import BUILDERS
+from ..model.lod_tree import CHUNK_NODES, LodTree, NodeStream
+from ..model.scene import rotated_axis
+from ..model.sh import degree_of, width_of
+from ..model.splats import COLUMNS, FloatArray, Splats
+from ..system.progress import Progress
+from ..system.threads import blocks_of, for_blocks, on_threads, ordered_map
 from .job import ORDER, ROOT, Job, encoded_of, families_of, window_of
 from .store import Store
 
