@@ -7,13 +7,15 @@ __version__: str
 if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.comparison import ComparisonTable as ComparisonTable
     from .api.comparison import compare as compare
-    from .api.files import Tree as Tree
-    from .api.files import inspect as inspect
-    from .api.files import pack as pack
-    from .api.files import read as read
-    from .api.files import read_rad_chunk as read_rad_chunk
-    from .api.files import read_rad_header as read_rad_header
-    from .api.files import unpack as unpack
+    from .api.reports import inspect as inspect
+    from .api.splat_files import Tree as Tree
+    from .api.splat_files import Written as Written
+    from .api.splat_files import pack as pack
+    from .api.splat_files import read as read
+    from .api.splat_files import read_rad_chunk as read_rad_chunk
+    from .api.splat_files import read_rad_header as read_rad_header
+    from .api.splat_files import unpack as unpack
+    from .api.splat_files import write as write
     from .api.trees import arrange_chunks as arrange_chunks
     from .api.trees import build_lod as build_lod
     from .api.trees import extract_leaves as extract_leaves
@@ -29,8 +31,6 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.views import show as show
     from .api.views import ssim as ssim
     from .api.views import traverse as traverse
-    from .api.writing import Written as Written
-    from .api.writing import write as write
     from .cameras.camera import Camera as Camera
     from .cameras.sources import CameraPath as CameraPath
     from .codecs.options import RadOptions as RadOptions

@@ -160,48 +160,23 @@ def _compile_requested() -> None:
 
 #: The kernels of a command's jobs that take longest to compile, in the order in which they are called.
 JOBS = {
-    "quick": (
-        "node_rows.fill_leaf_rows",
-        "cell_pairs.merge_in_cells",
-        "cell_pairs.split_families",
-        "node_rows.fill_leaves",
-        "node_rows.merge_colors",
-        "node_rows.fill_merged_splats",
-    ),
-    "quality": (
-        "node_rows.fill_leaf_rows",
-        "pair_merge.merge_pairs",
-        "pair_merge.find_partners",
-        "prune.link",
-        "prune.size_ranks",
-        "prune.lay_out_children",
-        "node_rows.fill_leaves",
-        "node_rows.merge_colors",
-        "node_rows.fill_merged_splats",
-    ),
-    "chunks": (
-        "tree_links.find_parents",
-        "chunk_sets.fill_demand",
-        "chunk_sets.sort_within_chunks",
-        "chunk_sets.split_sets",
-    ),
-    "levels": ("tree_links.find_parents", "region_errors.compare_levels"),
-    "cuts": ("cut.find_cut", "cut_statistics.select", "cut_statistics.replace_drawn", "cut_statistics.measure_cut"),
-    "pictures": (
-        "cut.find_cut",
-        "project.project",
-        "raster.count_in_tiles",
-        "raster.list_in_tiles",
-        "raster.draw_tiles",
-    ),
-    "fit": (
-        "cut.find_cut",
-        "project.project",
-        "raster.draw_tiles",
-        "adam.step",
-        "backward.weigh_tiles",
-        "backward.carry_back",
-    ),
+    "quick": """
+        node_rows.fill_leaf_rows cell_pairs.merge_in_cells cell_pairs.split_families
+        node_rows.fill_leaves node_rows.merge_colors node_rows.fill_merged_splats
+    """,
+    "quality": """
+        node_rows.fill_leaf_rows pair_merge.merge_pairs pair_merge.find_partners
+        prune.link prune.size_ranks prune.lay_out_children
+        node_rows.fill_leaves node_rows.merge_colors node_rows.fill_merged_splats
+    """,
+    "chunks": """
+        tree_links.find_parents
+        chunk_sets.fill_demand chunk_sets.sort_within_chunks chunk_sets.split_sets
+    """,
+    "levels": "tree_links.find_parents region_errors.compare_levels",
+    "cuts": "cut.find_cut cut_statistics.select cut_statistics.replace_drawn cut_statistics.measure_cut",
+    "pictures": "cut.find_cut project.project raster.count_in_tiles raster.list_in_tiles raster.draw_tiles",
+    "fit": "cut.find_cut project.project raster.draw_tiles adam.step backward.weigh_tiles backward.carry_back",
 }
 
 
@@ -227,7 +202,7 @@ class CompileAhead:
     """
 
     def __init__(self, missing: Sequence[Unit], jobs: Sequence[str], compiling: str) -> None:
-        wanted = dict.fromkeys(name for job in jobs for name in JOBS[job])
+        wanted = dict.fromkeys(name for job in jobs for name in JOBS[job].split())
         by_name = {unit.name: unit for unit in missing if unit.name != compiling}
         self._left = [by_name[name] for name in wanted if name in by_name] if processors() > 1 else []
         self._current: Unit | None = None

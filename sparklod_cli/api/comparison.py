@@ -22,8 +22,7 @@ from ..system.output import check_writable, write_file
 from ..system.progress import Progress, silent
 from ..system.threads import on_threads, ordered_map
 from ..tables.assertions import check
-from ..tables.columns import FRAME, Column, Row, numbers, statistic
-from ..tables.notebook_table import Table
+from ..tables.columns import FRAME, Column, Row, Table, numbers, statistic
 from ..viewers.scenes import CutFinder, Scenes
 from ..viewers.viewer_settings import LodSettings
 from .arguments import BudgetLike, ProgressLike, budget_like, path_like, progress_callback

@@ -67,9 +67,9 @@ from .outputs import (
 from .rules import check, is_set
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import BakeSettings, Outcome, Pair
+    from ..api.trees import Outcome, Pair
     from ..bake.converting import Converted
-    from ..bake.settings import Baked, Source
+    from ..bake.settings import Baked, BakeSettings, Source
     from ..codecs.losses import Clamp, Losses
     from ..fitting.fit_settings import Refined
     from ..model.instances import Instance
@@ -351,7 +351,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     instances = _check(ctx, options, target)
     failed, console = False, Console(quiet=general.quiet, verbose=general.verbose)
     with console, contextlib.ExitStack() as stack:
-        from ..api.bake_jobs import bake_files, merged_source
+        from ..api.trees import bake_files, merged_source
 
         pairs: Sequence[Pair] = [(source, options.output_of(source, target)) for source in options.inputs]
         if target.file is not None and (options.merge or options.scene is not None):

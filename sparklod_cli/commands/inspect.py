@@ -103,13 +103,13 @@ class Checks:
         Raises:
             ExpectationError: the file cannot be understood.
         """
-        from ..inspection.expectations import parse, read
+        from ..inspection.report import parse_expectation, read_expectations
 
         if not self.has_expectations:
             return None
         with assert_errors():
-            given = [parse(text) for text in self.asserts]
-        return [*(read(self.expect) if self.expect is not None else ()), *given]
+            given = [parse_expectation(text) for text in self.asserts]
+        return [*(read_expectations(self.expect) if self.expect is not None else ()), *given]
 
 
 @dataclass(frozen=True)
@@ -199,7 +199,7 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
         for name in (each for each in output.histogram if each not in QUANTITIES):
             raise click.UsageError(f"--histogram: there is no quantity {name}; choose one of {', '.join(QUANTITIES)}")
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.inspect_jobs import check_outputs, read_original
+        from ..api.reports import check_outputs, read_original
         from ..inspection.blocks import CHUNK_COLUMNS
 
         console.announce_compiling()
@@ -259,7 +259,7 @@ class _Job:
     sections: list[FileSection] = dataclasses.field(default_factory=list)
 
     def inspect(self, file: Path) -> int:
-        from ..api.inspect_jobs import inspect_file, picture_of, thumbnail_of
+        from ..api.reports import inspect_file, picture_of, thumbnail_of
 
         start, name, options, output = time.perf_counter(), name_of(file), self.options, self.options.output
         threads, picture, problem, size = options.general.threads, None, None, 0

@@ -29,7 +29,7 @@ from click.shell_completion import get_completion_class
 from .. import __version__
 from ..system import machine
 from ..system.errors import SparklodError, reason_of
-from ..system.packages import DISTRIBUTION, install_hint, pip_install, required_by
+from ..system.machine import DISTRIBUTION, install_hint, pip_install, required_by
 from ..system.python_process import program_command
 from ..system.setting_fields import setting, whole
 from ..system.threads import processors

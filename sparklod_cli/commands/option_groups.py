@@ -35,7 +35,7 @@ from .outputs import Form, NamedPath, file_of, require_suffix
 from .rules import check, flags_set, is_set
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import BakeSettings
+    from ..bake.settings import BakeSettings
     from ..cameras.camera import Matrix
     from ..cameras.sources import CameraPath
     from ..model.instances import Instance
@@ -226,7 +226,7 @@ def bake_settings(
     ctx: click.Context, form: Form, scene: SceneOptions, written: WriteOptions, sh_codes: int | None, **more: Any
 ) -> BakeSettings:
     """Return the settings of a bake or conversion, `more` among them; loads numpy."""
-    from ..api.bake_jobs import BakeSettings
+    from ..bake.settings import BakeSettings
     from ..model.selection import Selection
 
     rad = dataclasses.replace(written.rad, chunked=form.chunked, sh_codes=sh_codes)

@@ -295,7 +295,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
         least = -(-(cameras.orbit or 1) // cameras.every)
     _output(ctx, options, least).check([], overwrite=True)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.jobs import draw_files
+        from ..api.views import draw_files
         from ..model.instances import instances_of
 
         if budget is not None and (question := doubt(budget.count)):

@@ -47,7 +47,7 @@ from .outputs import NamedPath, Target, claim_stdout, keep_apart, name_outputs, 
 from .rules import GOALS, check, flags_set
 
 if TYPE_CHECKING:
-    from ..api.bake_jobs import BakeSettings
+    from ..bake.settings import BakeSettings
 
 EXAMPLES = """\
   sparklod simplify scene.ply --to 10% -o small.ply
@@ -160,7 +160,8 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     general, inputs, output, target = options.general, options.inputs, options.output, Target.of(options.output)
     _check(ctx, options, target)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.bake_jobs import Baked, bake_files, merged_source
+        from ..api.trees import bake_files, merged_source
+        from ..bake.settings import Baked
 
         settings = options.settings(ctx, target)
         if options.to is not None and (question := doubt(options.to.count)):

@@ -154,7 +154,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     asserts = options.assertions() if options.asserts else []
     start = time.perf_counter()
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.jobs import traverse_files
+        from ..api.views import traverse_files
         from ..model.splats import COLUMNS
         from ..viewers.loaded_scene import TRAVERSED
 

@@ -22,7 +22,7 @@ from .option_groups import DEFAULT_UP, JSON, OVERWRITE, QUIET, UP, VERBOSE, Gene
 from .outputs import NamedPath, keep_apart
 
 if TYPE_CHECKING:
-    from ..api.viewing import Server, Site
+    from ..api.sites import Server, Site
 
 EXAMPLES = """\
   sparklod view scene-lod.rad
@@ -128,11 +128,11 @@ def view(ctx: click.Context, /, **_: Any) -> None:
     files, page, place, general = options.files, options.page, options.place, options.general
     keep_apart(ctx)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api import viewing
+        from ..api import sites
 
         if place.export is not None:
-            viewing.check_folder(place.export, overwrite=place.overwrite)
-        site = viewing.prepare(
+            sites.check_folder(place.export, overwrite=place.overwrite)
+        site = sites.prepare(
             files, served=place.export is None, threads=general.threads, progress=console.progress, **vars(page)
         )
         console.clear()
@@ -141,14 +141,14 @@ def view(ctx: click.Context, /, **_: Any) -> None:
         for note in site.notes:
             console.say(note)
         if place.export is not None:
-            size = viewing.export(site, place.export, overwrite=place.overwrite, progress=console.progress)
+            size = sites.export(site, place.export, overwrite=place.overwrite, progress=console.progress)
             console.clear()
             count = count_of(len(site.resources), "file")
             console.say(f"wrote {printable(str(place.export))}: {count}, {format_size(size)}")
             if options.as_json:
                 print_json({"folder": str(place.export), "bytes": size, "files": _files(site)})
         else:
-            server = viewing.Server(site, host=place.host, port=place.port, cors=place.cors, log=console.detail)
+            server = sites.Server(site, host=place.host, port=place.port, cors=place.cors, log=console.detail)
             _serve(console, server, opens=not place.no_open, as_json=options.as_json)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -106,7 +107,6 @@ def page(sections: Sequence[FileSection]) -> str:
     """Return the page about one or more files, as HTML to be written in UTF-8."""
     one = len(sections) == 1
     title = f"{_text(sections[0].report.get('file', ''))} \u2013 sparklod inspect" if one else "sparklod inspect"
-    style = files(__package__).joinpath("page.css").read_text("utf-8")
     contents = ""
     if not one:
         head = ("File", "Format", "Splats", "Size", "Findings")
@@ -117,26 +117,11 @@ def page(sections: Sequence[FileSection]) -> str:
             rows.append([name, *shown, _verdict(report)])
         contents = f'<nav class="panel" aria-label="Files">{_table(head, rows, "The files")}</nav>\n'
     body = "\n".join(_section(section, f"file-{number}") for number, section in enumerate(sections, 1))
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy" content="{escape(POLICY)}">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="generator" content="sparklod {__version__}">
-<title>{title}</title>
-<style>
-{style}</style>
-</head>
-<body>
-<header class="page"><h1>Report on {"a splat file" if one else f"{len(sections)} splat files"}</h1></header>
-<main>
-{contents}{body}
-</main>
-<footer>Written by sparklod {__version__}.</footer>
-</body>
-</html>
-"""
+    template = Template(files(__package__).joinpath("page.html").read_text("utf-8"))
+    subject = "a splat file" if one else f"{len(sections)} splat files"
+    return template.substitute(
+        policy=escape(POLICY), version=__version__, title=title, subject=subject, contents=contents, body=body
+    )
 
 
 def _section(section: FileSection, anchor: str) -> str:

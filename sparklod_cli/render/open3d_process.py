@@ -22,7 +22,7 @@ from typing import IO, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..system.packages import pip_install
+from ..system.machine import pip_install
 
 #: Columns of the splats of a request: centre, scale, quaternion w x y z, logit of opacity, first spherical harmonics.
 COLUMNS = 14

@@ -11,7 +11,7 @@ import functools
 import io
 import posixpath
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -106,8 +106,6 @@ class Address:
         self, mode: Literal["rb"] = "rb", buffering: int = READ_AHEAD, *, size: int | None = None
     ) -> io.BufferedReader:
         """Open the file for reading; `size` is its size in bytes, if that is known."""
-        from .ranged_file import RangedFile
-
         return io.BufferedReader(RangedFile(self.read, self.size() if size is None else size), buffering)
 
     def read(self, start: int, stop: int) -> bytes:
@@ -169,6 +167,36 @@ class Address:
 
     def _shown(self, error: Exception | str) -> str:
         return without_secrets(str(error), self.url)
+
+
+class RangedFile(io.RawIOBase):
+    """A file whose bytes `read(start, stop)` requests when they are needed; `size` is in bytes."""
+
+    def __init__(self, read: Callable[[int, int], bytes], size: int) -> None:
+        self._read, self._size, self._at = read, size, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = max(0, offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence])
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        stop = min(self._at + len(view), self._size)
+        if stop <= self._at:
+            return 0
+        data = self._read(self._at, stop)
+        view[: len(data)] = data
+        self._at += len(data)
+        return len(data)
 
 
 #: A file or folder, wherever it is.

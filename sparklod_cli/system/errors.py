@@ -157,7 +157,7 @@ def optional_import(
     try:
         yield
     except ImportError as reason:
-        from .packages import install_hint  # as every command loads this module
+        from .machine import install_hint  # as every command loads this module
 
         raise error(f"{purpose}: {install_hint(extra, package=package)} ({reason})") from None
 

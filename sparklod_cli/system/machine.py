@@ -1,13 +1,15 @@
-"""Memory and processors available to this process, and the limits that a container sets on both.
+"""Memory, processors and Python packages of this process, with the limits that a container sets.
 
-Each function returns None if the system does not provide the figure; none of them raises.
+Functions about memory and processors return None if the system does not provide the figure; none of them raises.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 #: Least value that means "no limit" in cgroups version 1, where the kernel writes the largest multiple of a page.
@@ -92,3 +94,152 @@ def release_memory() -> None:
 
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library; Windows has no name for it
         ctypes.CDLL(None).malloc_trim(0)
+
+
+#: Folder that this package is in: a checkout, or one of installed packages.
+_HOME = Path(__file__).parents[2]
+
+#: Name of this distribution, for pip.
+DISTRIBUTION = "sparklod"
+
+#: Files in the environment of a program that pipx or `uv tool` installed.
+_PIPX, _UV_TOOL = "pipx_metadata.json", "uv-receipt.toml"
+
+
+def pip_install(*packages: str, options: Sequence[str] = ()) -> str:
+    """Return a command line that installs packages into the environment of this interpreter."""
+    import shlex
+
+    environment = Path(sys.prefix)
+    if (environment / _PIPX).is_file():
+        if options:
+            return shlex.join(["pipx", "runpip", environment.name, "install", *options, *packages])
+        return shlex.join(["pipx", "inject", environment.name, *packages])
+    return shlex.join([*_pip(environment), *options, *packages])
+
+
+def _pip(environment: Path) -> list[str]:
+    """Return the words of a command line for the pip of an environment, or for uv if it has no pip."""
+    import shutil
+    from importlib.util import find_spec
+
+    is_of_uv = (environment / _UV_TOOL).is_file()
+    if is_of_uv or (find_spec("pip") is None and shutil.which("uv")):
+        return ["uv", "pip", "install", "--python", sys.executable]
+    beside = Path(sys.executable).with_name("pip")
+    if sys.prefix == sys.base_prefix or not beside.is_file():
+        return [sys.executable, "-m", "pip", "install"]
+    if shutil.which("pip") == str(beside):
+        return ["pip", "install"]
+    with contextlib.suppress(OSError):  # no current folder
+        if beside.is_relative_to(Path.cwd()):
+            return [str(beside.relative_to(Path.cwd())), "install"]
+    return [str(beside), "install"]
+
+
+def install_hint(extra: str = "", *, package: str = "", options: Sequence[str] = ()) -> str:
+    """Return a command line that installs the requirements of this installation of sparklod, or of one of its extras.
+
+    No package index is known to have sparklod. So the command names the checkout that it was installed from, or else
+    the packages that are missing.
+
+    Args:
+        package: the only package to install, in the version that the extra requires; empty for all of them.
+        options: of pip.
+    """
+    from importlib import metadata  # takes long to load
+
+    checkout = None if package or (Path(sys.prefix) / _PIPX).is_file() else _checkout()
+    if checkout is not None:
+        editable = ["-e"] if checkout == _HOME else []
+        return pip_install(*editable, f"{checkout}[{extra}]" if extra else str(checkout), options=options)
+    try:
+        required = list(required_by(DISTRIBUTION, extra))
+    except metadata.PackageNotFoundError:
+        if not package:
+            what = f"the extra {extra} of sparklod" if extra else "sparklod"
+            return f"install {what} with pip, from a checkout of its repository"
+        required = []
+    if package:
+        requirements = [one.requirement for one in required if one.name == package][:1] or [package]
+    else:
+        requirements = [one.requirement for one in required if one.missing] or [one.requirement for one in required]
+    return pip_install(*dict.fromkeys(requirements), options=options)
+
+
+def _checkout() -> Path | None:
+    """Return the folder of the repository that holds this package, or that it was installed from, if any."""
+    import json
+    from importlib import metadata
+    from urllib.parse import unquote, urlsplit
+
+    folders = [_HOME]
+    with contextlib.suppress(metadata.PackageNotFoundError, ValueError, AttributeError):
+        source = json.loads(metadata.distribution(DISTRIBUTION).read_text("direct_url.json") or "{}")
+        address = urlsplit(source.get("url", ""))
+        if address.scheme == "file" and "dir_info" in source:
+            folders.append(Path(unquote(address.path)))
+    return next((folder for folder in folders if (folder / "pyproject.toml").is_file()), None)
+
+
+@dataclass(frozen=True)
+class Required:
+    """A distribution that another one requires.
+
+    Attributes:
+        least: the minimum version; empty for any.
+        version: the installed version; None if it is not installed.
+        source: the requirement of pip that brings it, if it names another distribution: "imageio[ffmpeg]>=2.31".
+    """
+
+    name: str
+    least: str
+    version: str | None
+    source: str = ""
+
+    @property
+    def requirement(self) -> str:
+        return self.source or (f"{self.name}>={self.least}" if self.least else self.name)
+
+    @property
+    def missing(self) -> bool:
+        from packaging.version import Version
+
+        return self.version is None or bool(self.least and Version(self.version) < Version(self.least))
+
+    @property
+    def state(self) -> str:
+        """The state for display: "2.4.6", "is missing", or "1.20, older than 1.26"."""
+        if self.version is None:
+            return "is missing"
+        return f"{self.version}, older than {self.least}" if self.missing else self.version
+
+
+def required_by(distribution: str, extra: str = "") -> Iterator[Required]:
+    """Yield the requirements of a distribution or, if an extra is given, of the extra alone.
+
+    Raises:
+        importlib.metadata.PackageNotFoundError: the distribution is not installed.
+    """
+    from importlib import metadata  # takes long to load
+
+    from packaging.requirements import Requirement
+
+    for line in metadata.requires(distribution) or []:
+        requirement = Requirement(line)
+        is_basic, is_of_extra = (
+            requirement.marker is None or requirement.marker.evaluate({"extra": name}) for name in ("", extra)
+        )
+        if not is_of_extra or (extra and is_basic):
+            continue
+        least = next((each.version for each in requirement.specifier if each.operator == ">="), "")
+        try:
+            version = metadata.version(requirement.name)
+        except metadata.PackageNotFoundError:
+            version = None
+        extras = sorted(requirement.extras)
+        source = f"{requirement.name}[{','.join(extras)}]" + f">={least}" * bool(least) if extras else ""
+        yield Required(requirement.name, least, version, source)
+        if version is not None:
+            for inner in extras:
+                yield from (replace(one, source=source) for one in required_by(requirement.name, inner))

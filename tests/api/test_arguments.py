@@ -16,7 +16,7 @@ import pytest
 
 import sparklod_cli as sparklod
 from sparklod_cli import CameraPathError, FormatError
-from sparklod_cli.api.files import Tree
+from sparklod_cli.api.splat_files import Tree
 from sparklod_cli.codecs.formats import MANIFEST
 from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.model.lod_tree import LodTree

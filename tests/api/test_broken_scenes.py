@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
-from sparklod_cli.api.files import Tree
+from sparklod_cli.api.splat_files import Tree
 from sparklod_cli.codecs.formats import ENCODINGS, MANIFEST, WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.spark_codings import SplatEncoding

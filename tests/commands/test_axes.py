@@ -14,7 +14,7 @@ import pytest
 
 import sparklod_cli as sparklod
 from fixtures import by_hand_glb, by_hand_tiles
-from sparklod_cli.api.viewing import prepare
+from sparklod_cli.api.sites import prepare
 from sparklod_cli.cli import COMMANDS
 from sparklod_cli.cli import cli as program
 from sparklod_cli.codecs import spz

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparklod_cli.api import inspect_jobs
+from sparklod_cli.api import reports
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.images import pyvista_scene, scene_plots
-from sparklod_cli.inspection.expectations import FORMATS, NAMES
 from sparklod_cli.inspection.findings import Finding
+from sparklod_cli.inspection.report import NAMED_FORMATS, SHORT_NAMES
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
@@ -263,7 +263,7 @@ def test_files_without_splats_have_a_report(name: str, cli: Cli) -> None:
 
 
 def test_a_scene_is_freed_before_the_next_is_read(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
-    read = inspect_jobs.inspect
+    read = reports.report_on
     seen: list[weakref.ref[object]] = []
 
     def look(*arguments: Any, **settings: Any) -> Any:
@@ -272,7 +272,7 @@ def test_a_scene_is_freed_before_the_next_is_read(cli: Cli, monkeypatch: pytest.
         seen.append(weakref.ref(scene))
         return report, scene
 
-    monkeypatch.setattr(inspect_jobs, "inspect", look)
+    monkeypatch.setattr(reports, "report_on", look)
     cli("inspect --json" + " sh1-sog" * 4)
     assert len(seen) == 4
 
@@ -315,7 +315,7 @@ def test_an_assertion_that_fails_is_exit_status_3_and_one_line(text: str, cli: C
     assert line.startswith(f"{TREE}: error: expect.") and f"{text}: " in line
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SHORT_NAMES)
 def test_every_short_name_has_a_value_of_a_tree(name: str, cli: Cli) -> None:
     parts = "sh1-streamed-sog"
     files = {
@@ -324,7 +324,7 @@ def test_every_short_name_has_a_value_of_a_tree(name: str, cli: Cli) -> None:
         "RAD, Streamed SOG or 3D Tiles": parts,
         "3D Tiles": "sh1-tiles",
     }
-    done = cli(f"inspect {files.get(FORMATS.get(name, ''), TREE)} --assert {name}==12345", status=3)
+    done = cli(f"inspect {files.get(NAMED_FORMATS.get(name, ''), TREE)} --assert {name}==12345", status=3)
     assert f"{name}==12345: {name} is " in done.out
 
 

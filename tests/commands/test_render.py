@@ -20,7 +20,7 @@ from sparklod_cli.images.picture_files import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAM
 from sparklod_cli.images.pixels import cells
 from sparklod_cli.render.render_settings import BACKENDS, COLOR_BY, STYLES
 from sparklod_cli.render.renderer import Renderer
-from sparklod_cli.system.packages import install_hint
+from sparklod_cli.system.machine import install_hint
 from sparklod_cli.viewers import scenes
 from tests.commands.cli import NAMED, Cli, process
 from tests.conftest import FIXTURES

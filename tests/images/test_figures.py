@@ -29,7 +29,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.color_scales import MAGMA, PLASMA, VIRIDIS, ramp
 from sparklod_cli.simulation.results import Extremes, add_extremes, moments_of
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.system.packages import install_hint
+from sparklod_cli.system.machine import install_hint
 from sparklod_cli.tables.columns import Row, totals
 from tests.scenes import random_splats
 from tests.tables.rows import flight, row

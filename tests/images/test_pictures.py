@@ -28,7 +28,7 @@ from sparklod_cli.render.color_scales import VIRIDIS, smooth
 from sparklod_cli.render.render_settings import RenderSettings
 from sparklod_cli.render.renderer import DrawnPicture, Renderer, averaged
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.system.packages import install_hint
+from sparklod_cli.system.machine import install_hint
 from sparklod_cli.viewers.scenes import CutFinder, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings
 from tests.conftest import FIXTURES

@@ -9,8 +9,16 @@ from pathlib import Path
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.inspection.expectations import ExpectationError, check, parse, read
-from sparklod_cli.inspection.report import NoFieldError, Report, ReportSettings, inspect
+from sparklod_cli.inspection.report import (
+    ExpectationError,
+    NoFieldError,
+    Report,
+    ReportSettings,
+    check_expectations,
+    inspect,
+    parse_expectation,
+    read_expectations,
+)
 from sparklod_cli.system.errors import SparklodError
 from tests.conftest import FIXTURES, Capture
 
@@ -35,7 +43,7 @@ def plain() -> Report:
 
 
 def codes(report: Report, *texts: str) -> list[str]:
-    return [finding.code for finding in check(report, [parse(text) for text in texts])]
+    return [finding.code for finding in check_expectations(report, [parse_expectation(text) for text in texts])]
 
 
 @pytest.mark.parametrize(
@@ -68,7 +76,7 @@ def test_each_expectation_holds_or_gives_its_code(
 
 def test_every_expectation_that_fails_is_reported(tree: Report, plain: Report) -> None:
     texts = ("bytes<=1", "leaves<=1", "sh==3", "lod==false", "growth<=1", "splats==1")
-    found = check(tree, [parse(text) for text in texts])
+    found = check_expectations(tree, [parse_expectation(text) for text in texts])
     assert [each.code.removeprefix("expect.") for each in found] == ["bytes", "splats", "sh", "lod", "growth", "value"]
     assert found[1].message == "leaves<=1: leaves is 6"
     assert found[4].message == "growth<=1: growth is 1.5"
@@ -106,7 +114,7 @@ def test_values_of_the_report_are_met_or_give_a_finding(tree: Report, way: str, 
     if way == "header.comment":
         tree = dataclasses.replace(tree, header={"comment": "a>b"})  # type: ignore[dict-item]
     assert codes(tree, way + holds) == []
-    (found,) = check(tree, [parse(way + fails)])
+    (found,) = check_expectations(tree, [parse_expectation(way + fails)])
     assert found.code == "expect.value"
     assert found.message.startswith(f"{way}{fails}: {way} is ")
 
@@ -182,9 +190,9 @@ def test_a_file_has_an_assertion_a_line(tmp_path: Path, tree: Report) -> None:
     path = written(
         tmp_path, '\ufeff# of all trees\n\nnodes<5M\r\n  format=="SPZ 3 LoD"  \n  # tree.depth==9\ntree.growth<=1.5'
     )
-    assert read(path) == [parse(text) for text in texts]
-    assert check(tree, read(path)) == []
-    assert read(written(tmp_path, "")) == read(written(tmp_path, "", "empty.toml")) == []
+    assert read_expectations(path) == [parse_expectation(text) for text in texts]
+    assert check_expectations(tree, read_expectations(path)) == []
+    assert read_expectations(written(tmp_path, "")) == read_expectations(written(tmp_path, "", "empty.toml")) == []
 
 
 OLD = """
@@ -205,10 +213,10 @@ OLD_JSON = '{"max_bytes": 1000, "min_splats":1, "max_splats": 10, "sh": 0, "lod"
 @pytest.mark.parametrize(("name", "text"), [("expect.toml", OLD), ("expect.JSON", OLD_JSON)])
 def test_an_old_file_is_refused_with_its_new_lines(name: str, text: str, tmp_path: Path, tree: Report) -> None:
     with pytest.raises(ExpectationError, match="as TOML or JSON, which are no longer read") as caught:
-        read(written(tmp_path, text, name))
+        read_expectations(written(tmp_path, text, name))
     lines = "bytes<=1000, leaves>=1, leaves<=10, sh==0, lod==true, growth<=1.5"
     assert f"one a line: {lines}, NAME==VALUE" in str(caught.value)
-    assert read(written(tmp_path, lines.replace(", ", "\n"), name))
+    assert read_expectations(written(tmp_path, lines.replace(", ", "\n"), name))
 
 
 @pytest.mark.parametrize(
@@ -229,7 +237,7 @@ def test_an_old_file_is_refused_with_its_new_lines(name: str, text: str, tmp_pat
 def test_an_unknown_expectation_is_an_error_that_names_the_file(tmp_path: Path, text: str, message: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(SparklodError) as caught:
-        read(path)
+        read_expectations(path)
     assert str(caught.value).startswith(str(path))
     assert message in str(caught.value)
     assert str(caught.value).isprintable()
@@ -242,7 +250,7 @@ def test_a_file_that_cannot_be_read_is_an_error_that_names_it(tmp_path: Path, co
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(SparklodError) as caught:
-        read(path)
+        read_expectations(path)
     assert str(path) in str(caught.value)
 
 

@@ -28,7 +28,7 @@ from sparklod_cli.render.open3d_process import PIECE
 from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade
 from sparklod_cli.render.render_settings import PROFILES, SORTINGS, SORTS, RasterSettings
 from sparklod_cli.system.errors import BackendError, SparklodError
-from sparklod_cli.system.packages import install_hint
+from sparklod_cli.system.machine import install_hint
 from tests.conftest import FIXTURES, ROOT
 from tests.render.drawables import balls, joined, one, psnr, rows, shown
 from tests.render.drawables import camera as plain_camera

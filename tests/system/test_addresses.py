@@ -16,7 +16,7 @@ import pytest
 from sparklod_cli.system import addresses
 from sparklod_cli.system.addresses import Address, place_of
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.system.packages import install_hint
+from sparklod_cli.system.machine import install_hint
 from sparklod_cli.system.untrusted import printable
 
 pytestmark = pytest.mark.slow

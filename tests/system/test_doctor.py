@@ -19,9 +19,9 @@ from sparklod_cli import warmup
 from sparklod_cli.commands import installation as doctor
 from sparklod_cli.commands.installation import Check, check_all
 from sparklod_cli.render import opengl
-from sparklod_cli.system import jit, machine, packages
+from sparklod_cli.system import jit, machine
 from sparklod_cli.system.errors import CameraPathError, SparklodError, optional_import
-from sparklod_cli.system.packages import Required, install_hint, pip_install, required_by
+from sparklod_cli.system.machine import Required, install_hint, pip_install, required_by
 from tests.conftest import ROOT
 
 # --- Packages ---------------------------------------------------------------------------------------------------------
@@ -51,11 +51,11 @@ def environment(folder: Path, monkeypatch: pytest.MonkeyPatch, *files: str) -> P
 @pytest.fixture
 def install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> object:
     """Has sparklod seem to be installed from somewhere, in an active environment, with some packages missing."""
-    monkeypatch.setattr(packages, "_HOME", tmp_path / "site-packages")
+    monkeypatch.setattr(machine, "_HOME", tmp_path / "site-packages")
     environment(tmp_path / "venv", monkeypatch)
     monkeypatch.setenv("PATH", str(tmp_path / "venv/bin"))
     required = [Required("numpy", "1.26", "2.0"), Required("pyvista", "0.45", None), Required("pandas", "", None)]
-    monkeypatch.setattr(packages, "required_by", lambda name, extra="": iter(required))
+    monkeypatch.setattr(machine, "required_by", lambda name, extra="": iter(required))
     return lambda origin: monkeypatch.setattr(metadata, "distribution", lambda name: Installed(origin))
 
 
@@ -84,7 +84,7 @@ def test_elsewhere_the_missing_packages_are_named(install, origin: object) -> No
 
 def test_where_no_package_is_missing_all_are_named(install, monkeypatch: pytest.MonkeyPatch) -> None:
     install(None)
-    monkeypatch.setattr(packages, "required_by", lambda name, extra="": iter([Required("numpy", "1.26", "2.0")]))
+    monkeypatch.setattr(machine, "required_by", lambda name, extra="": iter([Required("numpy", "1.26", "2.0")]))
     assert install_hint(options=["--force-reinstall"]) == "pip install --force-reinstall 'numpy>=1.26'"
 
 
@@ -93,7 +93,7 @@ def test_a_copy_that_is_not_installed_names_the_extra(install, monkeypatch: pyte
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "distribution", absent)
-    monkeypatch.setattr(packages, "required_by", absent)
+    monkeypatch.setattr(machine, "required_by", absent)
     assert "the extra render of sparklod" in install_hint("render")
 
 
@@ -215,7 +215,7 @@ def test_requirements_have_markers_and_extras() -> None:
 @pytest.mark.parametrize("films", ["10.0", "1.0", None])
 def test_a_hint_keeps_the_extras_of_requirements(films: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without [ffmpeg], whoever follows it gets the next hint."""
-    monkeypatch.setattr(packages, "_checkout", lambda: None)
+    monkeypatch.setattr(machine, "_checkout", lambda: None)
     monkeypatch.setitem(VERSIONS, "films", films) if films else monkeypatch.delitem(VERSIONS, "films")
     assert shlex.split(install_hint("video"))[-1] == "films[ffmpeg,other]>=2.31"
     assert shlex.split(install_hint("video", package="films"))[-1] == "films[ffmpeg,other]>=2.31"

@@ -371,7 +371,7 @@ def test_every_process_of_python_is_started_in_this_way() -> None:
     calls = re.compile(r"\b(program_command|module_command|safe_path)\(")
     users = {name for name, text in texts.items() if calls.search(text)}
     assert users - {helper, "system/jit"} == set(STARTED)
-    shown = {"commands/installation", "system/packages"}  # its path, by which they start nothing
+    shown = {"commands/installation", "system/machine"}  # its path, by which they start nothing
     assert {name for name, text in texts.items() if "sys.executable" in text} == {helper, *shown}
 
 

@@ -20,7 +20,7 @@ from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.simulation.results import COLUMNS, EMPTY
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.system.packages import install_hint
+from sparklod_cli.system.machine import install_hint
 from sparklod_cli.tables import assertions
 from sparklod_cli.tables.assertions import SIGNS, BadAssertionError, Outcome, parse
 from sparklod_cli.tables.columns import FORMS, STATISTICS, TYPES, Cell, Column, Row

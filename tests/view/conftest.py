@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.api import viewing
+from sparklod_cli.api import sites
 from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.view.server import Server
 from sparklod_cli.view.site import FILES, LICENSES, MODULES, VERSIONS, Site
@@ -35,7 +35,7 @@ class Answer:
 
 def prepared(paths: Sequence[Path], *, served: bool = True, **options: Any) -> Site:
     """The site of some files."""
-    return viewing.prepare(paths, served=served, threads=1, **options)
+    return sites.prepare(paths, served=served, threads=1, **options)
 
 
 @contextlib.contextmanager

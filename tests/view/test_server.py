@@ -22,7 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sparklod_cli as sparklod
-from sparklod_cli.api import viewing
+from sparklod_cli.api import sites
 from sparklod_cli.cli import run
 from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.view.server import Server, span_of
@@ -372,12 +372,12 @@ def test_a_browser_is_opened_with_the_address(monkeypatch: pytest.MonkeyPatch, c
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr(webbrowser, "open", lambda url: opened.append(url) or True)
 
-    def serve(server: viewing.Server) -> None:
+    def serve(server: sites.Server) -> None:
         while not opened:
             pass
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(viewing.Server, "serve_forever", serve)
+    monkeypatch.setattr(sites.Server, "serve_forever", serve)
     assert run(["view", str(TREE)]) == 0
     assert capfd.readouterr().out.split() == opened
 

@@ -1,4 +1,4 @@
-"""Reports of `inspect` with the outcome of checks, and pictures of the files."""
+"""Reports on splat files, with findings of checks and pictures of the files."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..inspection import expectations, leaves
+from ..inspection import leaves
 from ..inspection.findings import Finding
-from ..inspection.report import Report, ReportSettings, inspect
+from ..inspection.report import NO_CHILDREN, Report, ReportSettings, check_expectations
+from ..inspection.report import inspect as report_on
 from ..io.reading import read_scene
 from ..model.scene import Scene
-from ..system.errors import FormatError, SparklodError, naming
+from ..system.errors import FormatError, SparklodError, memory_errors_translated, naming
 from ..system.output import check_writable
 from ..system.progress import Progress
+from ..system.threads import thread_count
 from ..tables.assertions import Assertion
+from .arguments import ProgressLike, progress_callback
 
 if TYPE_CHECKING:
     from ..images.scene_plots import DescribedPicture
@@ -24,6 +27,31 @@ if TYPE_CHECKING:
 #: Width and height of the thumbnail on a page, pixels; the splats of the cut that it shows; and the most splats of a
 #: scene without a tree that is drawn for it: more take seconds.
 THUMBNAIL, THUMBNAIL_BUDGET, MOST_SPLATS = (512, 384), 200_000, 3_000_000
+
+
+def inspect(
+    path: Path | str,
+    *,
+    values: bool = False,
+    all_quantities: bool = False,
+    check: bool = False,
+    threads: int | None = None,
+    progress: ProgressLike = None,
+) -> Report:
+    """Report the contents and faults of a file; `inspect --json` prints `Report.as_dict`.
+
+    Args:
+        path: of a splat file, or of a folder that holds an unpacked SOG.
+        values: look at the numbers of the splats.
+        all_quantities: every quantity of them.
+        check: look for faults. An unreadable file is a finding, not an error.
+        threads: to decode on; None for all processors.
+        progress: called with how much is done.
+    """
+    wanted = ReportSettings(values=values or all_quantities, all_quantities=all_quantities, check=check)
+    with progress_callback(progress) as callback, memory_errors_translated():
+        found, _ = report_on(Path(path), wanted, threads=thread_count(threads), progress=callback)
+    return found
 
 
 def check_outputs(plot: Path | None, html: Path | None, *, overwrite: bool) -> None:
@@ -60,12 +88,12 @@ def inspect_file(
         original: the scene whose splats the leaves must equal.
         everything: report findings of all severities; otherwise a file with expectations has errors only.
     """
-    report, scene = inspect(path, settings, threads=threads, progress=progress)
+    report, scene = report_on(path, settings, threads=threads, progress=progress)
     if report.format is None or not (everything or expected is not None or original is not None):
         return report, scene
     findings = [each for each in report.findings or [] if everything or each.severity == "error"]
     if expected is not None:
-        findings += expectations.check(report, expected)
+        findings += check_expectations(report, expected)
     if original is not None:
         nothing = [Finding("expect.leaves", "the file does not contain all of its splats, so they cannot be compared")]
         findings += nothing if scene is None else leaves.check(scene, original, report.rad)
@@ -87,8 +115,7 @@ def picture_of(scene: Scene | None, by: str, depth: int | None) -> tuple[Describ
 def thumbnail_of(report: Report, scene: Scene, threads: int) -> DescribedPicture | None:
     """Return the scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
     from ..images.scene_plots import DescribedPicture
-    from ..inspection.report import NO_CHILDREN
-    from .files import as_tree
+    from .splat_files import as_tree
     from .views import cut, orbit, render, show
 
     count = len(scene.splats)
