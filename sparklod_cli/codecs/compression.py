@@ -73,9 +73,10 @@ def gzip_member(
     total = sum(size for size, _ in runs)
     parts: list[tuple[int, tuple[Way, ...]]] = [(total, ((level, zlib_ng.Z_DEFAULT_STRATEGY),))]
     if total > BLOCK:
-        parts = []
+        parts, hasty = [], level < DEFAULT_COMPRESSION
         for size, ways in runs:
-            chosen = tuple(dict.fromkeys(_at_level(way, level) for way in ways))
+            levels = [level if least is None or hasty else max(level, least) for least, _ in ways]
+            chosen = tuple(dict.fromkeys(zip(levels, (strategy for _, strategy in ways), strict=True)))
             parts += [(min(BLOCK, size - start), chosen) for start in range(0, size, BLOCK)]
     blocks = blocks_of_pieces(pieces, [size for size, _ in parts])
     items = zip(blocks, (ways for _, ways in parts), [False] * (len(parts) - 1) + [True], strict=True)
@@ -88,13 +89,6 @@ def gzip_member(
         check, done = zlib_ng.crc32(block, check), done + len(block)
         progress("writing", done, total, "B")
     yield struct.pack("<II", check, total & 0xFFFFFFFF)
-
-
-def _at_level(way: Way, level: int) -> Way:
-    least, strategy = way
-    if least is None or level < DEFAULT_COMPRESSION:
-        return level, strategy
-    return max(level, least), strategy
 
 
 def _deflated(block: memoryview, ways: tuple[Way, ...], last: bool) -> tuple[memoryview, bytes]:

@@ -50,7 +50,8 @@ def pack(splats: Splats, *, threads: int = 1) -> dict[str, Words]:
     def encode(part: slice) -> None:
         rows = texels[part]
         rows["center"] = splats.center[part]
-        rows["covariance"] = _encode_covariance(covariance(splats.scale[part], splats.quat_xyzw[part]))
+        stored = GAIN * covariance(splats.scale[part], splats.quat_xyzw[part])  # the largest element is on the diagonal
+        rows["covariance"] = stored * (LARGEST / np.maximum(stored.max(axis=1, keepdims=True), LARGEST))
         # 0..1 to a byte: ties to even, as the viewer's clamped array rounds.
         rows["rgba"][:, :3] = quantize.encode_unorm8(splats.rgb[part])
         rows["rgba"][:, 3] = quantize.encode_unorm8(splats.opacity[part])
@@ -67,9 +68,3 @@ def capacity(arrays: Mapping[str, NDArray[Any]]) -> int:
     if texture.dtype != np.uint32 or texture.ndim != 3 or texture.shape[1:] != (WIDTH, 4):
         raise FormatError(f"texture is {texture.dtype}{list(texture.shape)}, expected uint32[H, {WIDTH}, 4]")
     return len(texture) * SPLATS_A_ROW
-
-
-def _encode_covariance(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Multiply covariances by `GAIN`, scaled down to `LARGEST`; the largest element is on the diagonal."""
-    stored = values * GAIN
-    return stored * (LARGEST / np.maximum(stored.max(axis=1, keepdims=True), LARGEST))

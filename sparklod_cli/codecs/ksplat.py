@@ -133,7 +133,11 @@ def open_content(source: OpenFile) -> Reader:
         part, some = block
         splats = target.rows(part)
         section = sections[bisect(firsts, part.start) - 1]
-        splats.center[:] = _centers(section, part, some["center"]) if level else some["center"]
+        splats.center[:] = some["center"]
+        if level:  # steps from the low corner of a bucket
+            number = np.arange(part.start - section.first, part.stop - section.first)
+            middles = section.middles[np.searchsorted(section.ends, number, side="right")]
+            splats.center[:] = (splats.center - np.float32(section.steps)) * section.step + middles
         splats.scale[:] = some["scale"]
         splats.quat_xyzw[:] = normalized_quat(some["quat_wxyz"].astype(np.float32))[:, [1, 2, 3, 0]]
         splats.rgb[:] = quantize.decode_unorm8(some["rgb"])
@@ -152,12 +156,6 @@ def open_content(source: OpenFile) -> Reader:
 
     facts = {"level": level, "sections": len(sections), "trailing_bytes": source.size - end}
     return Reader(count, max(degrees, default=0), "KSPLAT", fill, header=facts, concurrent=True)
-
-
-def _centers(section: KsplatSection, part: slice, codes: NDArray[np.uint16]) -> FloatArray:
-    of_section = np.arange(part.start - section.first, part.stop - section.first)
-    bucket = np.searchsorted(section.ends, of_section, side="right")
-    return (codes.astype(np.float32) - np.float32(section.steps)) * section.step + section.middles[bucket]
 
 
 def _read(file: BinaryIO, kind: np.dtype[Any], count: int, subject: str) -> NDArray[Any]:

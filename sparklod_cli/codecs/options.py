@@ -18,7 +18,7 @@ from .formats import (
 if TYPE_CHECKING:
     from .spark_codings import SplatEncoding
 
-#: Entries of a palette of spherical harmonics: Spark's labels have 16 bits.
+#: Entries of a palette of spherical harmonics: labels have 16 bits in RAD and in SOG.
 MAX_SH_CODES = 65_536
 SH_CODES = whole(2, MAX_SH_CODES)
 
@@ -44,7 +44,6 @@ RAD_ENCODINGS = {
 
 #: Leaves the choice of an encoding to the writer, which goes by the scene.
 AUTO = "auto"
-
 
 #: The values of their options.
 RAD_CHOICES = {name: (AUTO, *encodings) for name, encodings in RAD_ENCODINGS.items()}

@@ -23,7 +23,7 @@ from ..model import MAX_SH_DEGREE
 from ..model.gaussian import normalized_quat
 from ..model.scene import Scene
 from ..model.sh import degree_of, notes_on_degree
-from ..model.splats import FloatArray, Splats
+from ..model.splats import FloatArray
 from ..system.errors import FormatError, NotSplatsError, PromiseError, TruncatedError
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, ordered_map
@@ -439,18 +439,18 @@ def encode(
     lines += [f"element vertex {len(splats)}"]
     lines += [f"property float {name}" for name in names]
     yield "".join(f"{line}\n" for line in [*lines, "end_header"]).encode()
-    yield from encode_rows(lambda part: _encode(splats, part, row_type), len(splats), threads, progress)
 
+    def rows_of_part(part: slice) -> bytes:
+        rows = np.zeros(part.stop - part.start, row_type)  # normals are 0: viewers ignore them
+        for column, names, _, encoder in COLUMNS:
+            values = encoder(getattr(splats, column)[part]).reshape(len(rows), -1)
+            for name, numbers in zip(names, values.T, strict=True):
+                rows[name] = numbers
+        for name, numbers in zip(rest, splats.sh[part].transpose(0, 2, 1).reshape(len(rows), -1).T, strict=True):
+            rows[name] = numbers
+        return rows.tobytes()
 
-def _encode(splats: Splats, part: slice, row_type: np.dtype[Any]) -> bytes:
-    rows = np.zeros(part.stop - part.start, row_type)  # normals are 0: viewers ignore them
-    for column, names, _, encoder in COLUMNS:
-        for name, values in zip(names, encoder(getattr(splats, column)[part]).reshape(len(rows), -1).T, strict=True):
-            rows[name] = values
-    sh = splats.sh[part].transpose(0, 2, 1).reshape(len(rows), -1)
-    for index in range(sh.shape[1]):
-        rows[f"f_rest_{index}"] = sh[:, index]
-    return rows.tobytes()
+    yield from encode_rows(rows_of_part, len(splats), threads, progress)
 
 
 # Compressed PLY: four packed words a splat, relative to the bounds of its chunk of 256.

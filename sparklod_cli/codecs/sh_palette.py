@@ -24,9 +24,6 @@ from ..model.splats import FloatArray, Splats
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, on_threads
 
-#: The most codes of a palette: labels have 16 bits in RAD and in SOG.
-MAX_CODES = 1 << 16
-
 #: Passes of k-means. Measured: more gain less than 0.5 % of the error.
 PASSES = 6
 
@@ -89,18 +86,14 @@ def cluster(
 
     Args:
         sh: (N, K, 3) finite float32 coefficients, K at least 1.
-        codes: the most codes, 1 to MAX_CODES.
+        codes: the most codes, 1 to `options.MAX_SH_CODES`.
         weight: (N,) how much the squared error of each row counts, finite and at least 0; None for 1 each.
         threads: to work on; None for all processors.
         progress: called with the number of cells, and then the passes of k-means.
 
     Raises:
-        ValueError: an argument is out of its range or has another shape.
+        ValueError: a coefficient is not finite.
     """
-    if sh.ndim != 3 or not sh.shape[1] or sh.shape[2] != 3:
-        raise ValueError(f"sh has the shape {sh.shape}; give (N, K, 3) with K at least 1")
-    if not 1 <= codes <= MAX_CODES:
-        raise ValueError(f"codes is {codes}; give 1 to {MAX_CODES:,}")
     rows = np.ascontiguousarray(sh, np.float32).reshape(len(sh), 3 * sh.shape[1])
     if len(rows) and not (np.isfinite(rows.min()) and np.isfinite(rows.max())):
         raise ValueError("sh holds NaN or infinity; give finite coefficients")
@@ -120,15 +113,11 @@ def _weights(weight: ArrayLike | None, count: int) -> Weights:
     """Return the weights of rows, positive, 1 in the mean."""
     if weight is None:
         return np.ones(count)
-    given = np.asarray(weight, np.float64)
-    if given.shape != (count,):
-        raise ValueError(f"weight has the shape {given.shape}; give ({count},), a weight for each row")
-    if not (np.isfinite(given) & (given >= 0)).all():
-        raise ValueError("weight holds a number below 0, NaN or infinity; give finite weights of at least 0")
-    largest = given.max(initial=0)
+    relative = np.asarray(weight, np.float64)
+    largest = relative.max(initial=0)
     if not largest > 0:
         return np.ones(count)
-    relative = given / largest
+    relative = relative / largest
     relative /= relative.mean()
     return np.maximum(relative, WEIGHT_FLOOR)
 

@@ -201,9 +201,6 @@ def zipped(files: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
 
 # Reading.
 
-#: Most entries of the palette of SH: a label has 16 bits.
-MAX_PALETTE = 1 << 16
-
 #: Most splats: a WebP image has at most this many texels.
 MAX_SPLATS = 1 << 28
 
@@ -270,8 +267,12 @@ def open_content(source: OpenFile) -> Reader:
 
         for number, _ in enumerate(ordered_map(work, enumerate(in_order()), threads), 1):
             progress("reading", number * count, len(steps) * count, "texel")
-        rows = Target(target.splats)
-        for_blocks(lambda part: _finish(center_tables, rows.rows(part)), len(target.splats), threads)
+
+        def finish(part: slice) -> None:
+            center = target.splats.center[part]
+            texels.look_up_words(center.view(np.uint32), center_tables, center)
+
+        for_blocks(finish, len(target.splats), threads)
 
     antialiased = version == 2 and (meta.value.get("antialias") is True or meta.value.get("model") == "antialiased")
     header = {"version": version, "palette": palette.entries if palette is not None else 0, "bytes": files.size}
@@ -283,39 +284,25 @@ def open_content(source: OpenFile) -> Reader:
 def _steps(meta: Json, version: int, palette: SogPalette | None) -> list[Step]:
     scales = quantize.decode_log(_tables(meta, "scales", version, 3))
     colors = _tables(meta, "sh0", version, 4 if version == 1 else 3)
-    byte = np.arange(256, dtype=np.uint8)
+    rgb, byte = quantize.decode_dc(colors[:3]), np.arange(256, dtype=np.uint8)
     opacity = quantize.decode_logit(colors[3]) if version == 1 else quantize.decode_unorm8(byte)
+
+    def words(place: int, splats: Splats, pixels: Pixels) -> None:
+        """Put a byte of the codes of coordinates in the place of the coordinates; two threads do so at a time."""
+        texels.place_bytes(pixels, splats.center.view(np.uint8), place)
+
+    def color(splats: Splats, pixels: Pixels) -> None:
+        texels.look_up(pixels, RED_GREEN_BLUE, rgb, splats.rgb)
+        texels.look_up(pixels, ALPHA, opacity[None], splats.opacity[:, None])
+
     steps = [
-        Step("means", 0, functools.partial(_fill_words, 0)),
-        Step("means", 1, functools.partial(_fill_words, 1)),
-        Step("quats", 0, _fill_quats),
-        Step("scales", 0, functools.partial(_fill_scales, scales)),
-        Step("sh0", 0, functools.partial(_fill_colors, quantize.decode_dc(colors[:3]), opacity[None])),
+        Step("means", 0, functools.partial(words, 0)),
+        Step("means", 1, functools.partial(words, 1)),
+        Step("quats", 0, lambda splats, pixels: texels.fill_quats(pixels, codings.quat_components(), splats.quat_xyzw)),
+        Step("scales", 0, lambda splats, pixels: texels.look_up(pixels, RED_GREEN_BLUE, scales, splats.scale)),
+        Step("sh0", 0, color),
     ]
     return steps if palette is None else [*steps, Step("shN", 1, functools.partial(_fill_sh, palette))]
-
-
-def _fill_words(place: int, splats: Splats, pixels: Pixels) -> None:
-    """Put a byte of the codes of coordinates where the coordinates will be; two threads do so at a time."""
-    texels.place_bytes(pixels, splats.center.view(np.uint8), place)
-
-
-def _finish(tables: FloatArray, splats: Splats) -> None:
-    """Decode coordinates in the place of their codes of 16 bits."""
-    texels.look_up_words(splats.center.view(np.uint32), tables, splats.center)
-
-
-def _fill_scales(tables: FloatArray, splats: Splats, pixels: Pixels) -> None:
-    texels.look_up(pixels, RED_GREEN_BLUE, tables, splats.scale)
-
-
-def _fill_colors(tables: FloatArray, opacity: FloatArray, splats: Splats, pixels: Pixels) -> None:
-    texels.look_up(pixels, RED_GREEN_BLUE, tables, splats.rgb)
-    texels.look_up(pixels, ALPHA, opacity, splats.opacity[:, None])
-
-
-def _fill_quats(splats: Splats, pixels: Pixels) -> None:
-    texels.fill_quats(pixels, codings.quat_components(), splats.quat_xyzw)
 
 
 def _fill_sh(palette: SogPalette, splats: Splats, pixels: Pixels) -> str | None:
@@ -350,7 +337,7 @@ class SogPalette:
     """Palette of SH, decoded when it is needed: K coefficients of each entry, and the number of entries."""
 
     def __init__(self, files: SogFiles, version: int) -> None:
-        width, height = files.sides("shN", 0, MAX_PALETTE * COEFFICIENTS[3])
+        width, height = files.sides("shN", 0, MAX_SH_CODES * COEFFICIENTS[3])
         self.coefficients = width // codings.PALETTE_WIDTH
         if self.coefficients not in COEFFICIENTS[1:4] or width % codings.PALETTE_WIDTH:
             raise FormatError(f"its image of SH centroids is {width} texels wide, expected 64 times 3, 8 or 15")

@@ -443,7 +443,10 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     """
     version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
     if version not in TREE_SPZ_VERSIONS:
-        _check_v4(scene)
+        if not isinstance(scene, Scene) or scene.tree is not None:  # statistics are those of a tree
+            raise FormatError("SPZ version 4 holds no tree that Spark reads; use version 2 or 3, or RAD")
+        if scene.up is not None and scene.up not in SYSTEM_OF_UP:
+            raise FormatError(f"SPZ version 4 cannot note that {scene.up} points up; use version 3, or turn the scene")
     found = Statistics.of_scene(scene, needed(options)) if isinstance(scene, Scene) else scene
     assert found.reach is not None
     bits, most = options.fractional_bits, largest_fractional_bits(found.reach)
@@ -457,14 +460,6 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     if not quantize.LEAST_SH_BITS <= sh_bits <= ALL_BITS:
         raise ValueError(f"sh_bits is {sh_bits}, not {quantize.LEAST_SH_BITS} to {ALL_BITS}")
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits, sh_bits=sh_bits)
-
-
-def _check_v4(scene: Scene | Statistics) -> None:
-    """Raise `FormatError` if version 4 cannot hold a scene; statistics are those of a tree."""
-    if not isinstance(scene, Scene) or scene.tree is not None:
-        raise FormatError("SPZ version 4 holds no tree that Spark reads; use version 2 or 3, or RAD")
-    if scene.up is not None and scene.up not in SYSTEM_OF_UP:
-        raise FormatError(f"SPZ version 4 cannot note that {scene.up} points up; use version 3, or turn the scene")
 
 
 def like(header: Mapping[str, int], options: WriteOptions) -> WriteOptions:

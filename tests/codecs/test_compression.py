@@ -129,13 +129,6 @@ def test_a_low_level_means_haste_whatever_the_data_are(level: int) -> None:
         assert b"".join(compression.gzip_member([data], [run], level, 1, silent)) == gzipped(data, level=level)
 
 
-def test_progress_ends_at_the_end() -> None:
-    said: list[tuple[str, int, int, str]] = []
-    data = sample(3 * BLOCK + 7)
-    list(compression.gzip_member([data], [(data.size, MIXED)], 1, 2, lambda *args: said.append(args)))
-    assert said == [("writing", min(BLOCK * (i + 1), len(data)), len(data), "B") for i in range(4)]
-
-
 PROMISED = 10 * compression.MAX_RATIO * compression.TRUSTED_SIZE
 
 

@@ -253,23 +253,16 @@ def code(field: str, encoding: SplatEncoding = DEFAULT, **columns: Any) -> Any:
     return pack(splats_with(**columns), encoding)["packed"].view(packed_splats.SPLAT)[0, 0][field].tolist()
 
 
+#: Codes of scales, of which 0 is that of a scale of 0, or below e ** -30, alone.
+SCALES = {0: 0, np.exp(-30.001): 0, np.exp(-29.999): 1, np.exp(-12): 1, np.exp(-12 + 21 / 254): 2}
+SCALES |= {1: 146, np.exp(9): 255, 3e38: 255}
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("field", "encoding", "columns", "expected"),
     [
-        *(
-            ("log_scale", DEFAULT, {"scale": scale}, [expected] * 3)
-            for scale, expected in [
-                (0, 0),
-                (np.exp(-30.001), 0),
-                (np.exp(-29.999), 1),  # not zero, so the smallest that there is
-                (np.exp(-12), 1),
-                (np.exp(-12 + 21 / 254), 2),
-                (1, 146),
-                (np.exp(9), 255),
-                (3e38, 255),
-            ]
-        ),
+        *(("log_scale", DEFAULT, {"scale": value}, [code] * 3) for value, code in SCALES.items()),
         *(("alpha", DEFAULT, {"opacity": value}, code) for value, code in [(0, 0), (0.5, 128), (1, 255), (1000, 255)]),
         # 1 is half-way between two codes of an LoD tree and goes up, to D = 1.016.
         *(("alpha", LOD, {"opacity": value}, code) for value, code in [(0, 0), (0.5, 64), (1, 128), (7.5, 177)]),

@@ -93,11 +93,6 @@ def test_no_number_is_far_from_an_even_book(seed: int, extent: float, gap: float
     assert np.abs(values - book[nearest(values, book)]).max() <= np.ptp(values[:-1]) / 254 / 2 * 1.001 + 1e-5
 
 
-def test_codes_have_the_shape_of_their_numbers() -> None:
-    values = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
-    np.testing.assert_array_equal(nearest(values, codebook(values)), values)
-
-
 DISTRIBUTIONS = {
     "even": lambda rng: rng.uniform(-3, 5, 40_000),
     "normal": lambda rng: rng.normal(-5, 1, 40_000),

@@ -112,17 +112,6 @@ def test_every_stream_of_a_tree_has_its_bytes(version: int) -> None:
         assert [code >> 30 for code in codes] == [0 if abs(a) > abs(b) else 3 for a, b in zip(x, w, strict=True)]
 
 
-def test_a_tree_comes_back() -> None:
-    scene = golden("tree-v3")
-    assert scene.format == "SPZ 3 LoD"
-    assert scene.tree is not None
-    assert scene.tree.child_count.tolist() == [3, 2, 0, 2, 0, 0, 0, 0]
-    assert scene.tree.child_start.tolist() == [1, 4, 0, 6, 0, 0, 0, 0]
-    d_root = 4 * (237 * 2 / 255) - 3
-    np.testing.assert_allclose(scene.splats.opacity[0], math.exp((d_root**2 - 1) / math.e), rtol=1e-5)
-    np.testing.assert_allclose(scene.splats.opacity[[3, 5]], [127 * 2 / 255, 0], rtol=1e-6)
-
-
 # --- Fractional bits --------------------------------------------------------------------------------------------------
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from sparklod_cli.codecs import quantize, spz, statistics
+from sparklod_cli.codecs import quantize, spz
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.statistics import (
@@ -67,26 +65,6 @@ def test_pieces_in_any_order_settle_as_the_whole(codec, sh_degree: int) -> None:
         rng.shuffle(parts)  # type: ignore[arg-type]
         found = Statistics.merged([Statistics.merged(parts[:3]), *parts[3:]])
         assert codec.settled(found, DEFAULTS) == codec.settled(scene, DEFAULTS)
-
-
-@pytest.mark.parametrize("codec", [spz, rad])
-def test_a_tree_whose_leaves_were_counted_settles_as_the_whole(
-    codec: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(statistics, "_BLOCK", 64)
-    scene, needed = tree_of(2_000, 3), codec.needed(DEFAULTS)
-    splats = scene.splats
-    center, scale = splats.center.copy(), splats.scale.copy()
-    center[0], scale[0] = 3_000, 80  # the root
-    scene = dataclasses.replace(scene, splats=dataclasses.replace(splats, center=center, scale=scale))
-    assert scene.tree is not None
-    leaf = scene.tree.is_leaf
-    leaves, inner = (Statistics.of(scene.splats.take(rows), leaf[rows], needed, threads=2) for rows in (leaf, ~leaf))
-    found = Statistics.merged([leaves, inner])
-    assert (found.count, found.tree) == (len(scene), True)
-    settled = codec.settled(found, DEFAULTS)
-    assert settled == codec.settled(Statistics.of(scene.splats, scene.tree.is_leaf, needed), DEFAULTS)
-    assert settled != codec.settled(leaves, DEFAULTS)
 
 
 def test_an_array_holds_all_of_them() -> None:
