@@ -38,7 +38,8 @@ class Format:
         endings: of the names of files that are written, suffixes or the name in `unbundled`; empty if it is only read.
             Its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
             `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
-            if the scene cannot be written; and `held(options, sh_degree)`, the `encoder.CodeRange`s that it can hold.
+            if the scene cannot be written; and, if it clamps values, `held(options, sh_degree)`, the
+            `encoder.CodeRange`s that it can hold.
         unbundled: the name of the first of the files as which a scene can also be written, all in one folder; None if
             there is no such way. Its module then has `encode_files(scene, options, *, threads, progress)`, too, which
             yields the name and the bytes of each, this one last.

@@ -201,7 +201,8 @@ def settled_with_losses(scene: Scene, form: Format, options: WriteOptions, threa
     """Return the options with nothing left open, and the losses of a scene in a format; raises as `settled`."""
     codec = form.codec()
     settled: WriteOptions = codec.settled(scene, options)
-    counts, clamps = clamps_in(scene.splats, threads, codec.held(settled, scene.splats.sh_degree))
+    ranges = codec.held(settled, scene.splats.sh_degree) if hasattr(codec, "held") else ()
+    counts, clamps = clamps_in(scene.splats, threads, ranges)
     drops_sh = any(clamp.column == "sh" and clamp.end == 0 for clamp in clamps)
     clamped = {column: count for column, count in counts.items() if column != "sh" or not drops_sh}
     return settled, Losses(clamped, drops_sh, scene.up if form.bare else None)

@@ -30,7 +30,6 @@ from ..system.threads import blocks_of, ordered_map
 from ..system.units import count_of
 from ..system.untrusted import quoted
 from . import quantize
-from .encoder import CodeRange
 from .options import DEFAULTS, WriteOptions
 from .reader import (
     HARMLESS,
@@ -412,11 +411,6 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     if scene.tree is not None:
         raise FormatError("PLY holds no Level-of-Detail tree")
     return options
-
-
-def held(options: WriteOptions, sh_degree: int) -> tuple[CodeRange, ...]:
-    """Return the values that PLY holds without clamping them: all, so there is no range."""
-    return ()
 
 
 def encode(

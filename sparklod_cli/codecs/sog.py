@@ -32,7 +32,6 @@ from ..system.untrusted import Json, Origin, quoted_value
 from . import quantize, sh_palette
 from . import sog_images as codings
 from .compression import check_promise
-from .encoder import CodeRange
 from .formats import META, SOG_IMAGES
 from .kernels import texels
 from .options import DEFAULTS, MAX_SH_CODES, WriteOptions
@@ -424,11 +423,6 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     _check(scene.splats)
     sog = dataclasses.replace(options.sog, sh_codes=codes_for(count) if codes is None else codes)
     return dataclasses.replace(options, sog=sog)
-
-
-def held(options: WriteOptions, sh_degree: int) -> tuple[CodeRange, ...]:
-    """Return the values that SOG holds without clamping them: its codebooks suit any."""
-    return ()
 
 
 def _check(splats: Splats) -> None:
