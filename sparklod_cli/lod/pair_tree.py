@@ -145,18 +145,18 @@ class Curve:
 class BinaryTree:
     """The binary tree of N leaves while it is built; leaves come first, then merged nodes in the order they are made.
 
-    A merge leaves two rows of leaves without use; the merged node takes over one of them. So each tree of the forest
-    has one row to spare, the next merge takes that of its first node, and N rows are enough for all 2N - 1 nodes.
+    A merge frees the rows of two leaves; the merged node takes over one of them. So each tree of the forest has one
+    unused row, which the next merge of its root takes over, and N rows are enough for all 2N - 1 nodes.
 
     Attributes:
         rows: (N, WIDTH) float32 node rows, see `kernels/pair_merge.py`; leaf k has row k until it is merged. The array
             owns its memory, and no other refers to it.
-        weight: (N,) float32 weights of the leaves, which outlast their rows.
+        weight: (N,) float32 weights of the leaves, which are needed after their rows.
         row: (N,) uint32 row of each merged node.
-        spare: (N,) uint32 row that is to spare in the tree of each merged node without a parent.
-        children: (N, 2) uint32, of merged nodes.
+        spare: (N,) uint32 unused row in the tree of each merged node without a parent.
+        children: (N, 2) uint32 children of merged nodes.
         size: (2N,) float32 feature sizes of leaves and merged nodes, units.
-        error: (N,) float32, `kernels.pair_merge.picture_error` of merged nodes.
+        error: (N,) float32 `kernels.pair_merge.picture_error` of merged nodes.
         used: number of nodes so far.
         rounds: number of rounds of merging so far.
     """
@@ -187,7 +187,7 @@ class BinaryTree:
         return len(self.row)
 
     def rows_of(self, nodes: Nodes) -> Nodes:
-        """Return the (n,) rows of nodes; those of leaves that are merged have other content by now."""
+        """Return the (n,) rows of nodes; rows of leaves that have merged are reused by other nodes."""
         found = np.empty(len(nodes), np.uint32)
         node_rows.fill_rows_of(len(nodes), nodes, self.row, self.leaves, found)
         return found
@@ -223,11 +223,11 @@ def lowest_level(levels: Levels) -> int:
 def merge_levels(
     binary: BinaryTree, levels: Levels, curve: Curve, region: Region | None, progress: Progress
 ) -> tuple[Nodes, Levels]:
-    """Merge pairs, level by level, but for nodes whose partners may be beyond a border; without one up to the root.
+    """Merge pairs, level by level, except nodes whose partners may be beyond a border; without a region up to the root.
 
     Args:
-        levels: (N,) that its leaves join at.
-        region: of the leaves; None for the whole scene.
+        levels: (N,) level at which each leaf joins.
+        region: None for the whole scene.
 
     Returns:
         (n,) uint32 nodes without a parent, and (n,) levels at which they would have merged next.
@@ -280,7 +280,10 @@ def _merge(
             partner, cost = partners(binary.rows, at, WINDOW, np.float32(largest))
             del at
             before = len(active)
-            pairs, rest = matched(active, partner, cost, _largest_cost(cost), binary.used, threads)
+            some = cost[:: max(1, len(cost) // SAMPLE)]
+            some = some[np.isfinite(some)]
+            limit = np.float32(np.quantile(some, CHEAP)) if len(some) > FEW else np.float32(np.inf)
+            pairs, rest = matched(active, partner, cost, limit, binary.used, threads)
             if rounds is None and not len(pairs):  # no finite cost: too far apart for float32
                 partner = np.arange(before, dtype=np.int32) ^ 1
                 partner[partner >= before] = -1
@@ -299,7 +302,7 @@ def _merge(
 
 
 def partners(rows: FloatArray, nodes: Nodes, window: int, largest: np.float32) -> tuple[NDArray[np.int32], FloatArray]:
-    """Return (n,) places of the cheapest partners of nodes, -1 for none, and costs; see `pair_merge.find_partners`."""
+    """Return (n,) places of nodes' cheapest partners, -1 without one, and costs; see `pair_merge.find_partners`."""
     partner, cost = np.empty(len(nodes), np.int32), np.empty(len(nodes), np.float32)
     pair_merge.find_partners(len(nodes), rows, nodes, window, largest, partner, cost)
     return partner, cost
@@ -328,13 +331,6 @@ def matched(
     return pairs, rest
 
 
-def _largest_cost(cost: FloatArray) -> np.float32:
-    """Return the largest cost of a pair that merges this round."""
-    some = cost[:: max(1, len(cost) // SAMPLE)]
-    some = some[np.isfinite(some)]
-    return np.float32(np.quantile(some, CHEAP)) if len(some) > FEW else np.float32(np.inf)
-
-
 @dataclass(frozen=True)
 class PruningGoal:
     """Bounds of the nodes of a pruned tree, and their order.
@@ -359,7 +355,7 @@ class PruningGoal:
 class FinalTree:
     """Pruned tree in final order.
 
-    If the tree is not whole, node 0 stands for what the nodes without a parent will be under, and is not to be drawn.
+    If the tree is not whole, node 0 stands for the future parents of the nodes without a parent, and is not drawn.
 
     Attributes:
         splats: M nodes as they are drawn.
@@ -392,11 +388,11 @@ def in_final_order(
     curve: Curve,
     progress: Progress,
 ) -> FinalTree:
-    """Prune a tree, and write its nodes and their colours in final order. The binary tree is of no use afterwards.
+    """Prune a tree, and return its nodes and their colours in final order; empties the binary tree.
 
     Args:
         index: (N,) splat of each of its leaves.
-        columns: of the splats as the leaves are drawn; emptied, so that each is freed if there is no other reference.
+        columns: columns of the splats; emptied, so that each is freed if there is no other reference.
     """
     n, hidden = binary.leaves, 0 if goal.is_whole else 1
     parent, saved, rank = _prune(binary, goal, progress)

@@ -9,10 +9,10 @@
 
 benchmarks/notes/quality-builder.md has the reasons, and the alternatives that were tried.
 
-In stages, the nodes of a region merge level by level, too. Before each level those nodes are set aside that are so
-close to the region's border that their best partner may be beyond it; they are handed on, and merge at that level in
-the stage of a larger region. So trees have no seams along borders. Each stage prunes the nodes that it made, and leaves
-part of what the growth allows to the stages above it.
+In stages, the nodes of a region merge level by level, too. Before each level, nodes so close to the region's border
+that their best partner may be beyond it are set aside and handed on; they merge at that level in the stage of a larger
+region. So trees have no seams along borders. Each stage prunes the nodes that it made, and leaves part of the growth to
+the stages above it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ RESERVE = 1.25
 #: ln(size in units) of rank 0: larger than any size.
 HIGHEST = 128 * math.log(2)
 
-#: The rank of the children of a leaf, which has none: after all others.
+#: Rank of the (missing) children of a leaf: after all others.
 LAST = np.iinfo(np.int32).max
 
 
@@ -113,7 +113,7 @@ class _Nodes:
     Attributes:
         rows: (n, WIDTH) float32 node rows.
         size: (n,) float32 feature sizes, units.
-        level: (n,) int32 at which they merge next.
+        level: (n,) int32 level at which each merges next.
         family: (n,) int64 numbers of their families.
         rank: (n,) int32 batches of their families, LAST for leaves.
         leaves, merged: (n,) int64 numbers of leaves and of merged nodes in their trees; only the sums have a meaning.
@@ -219,10 +219,10 @@ def _rest(
     """Return the nodes that a stage hands on: those without a parent, which come right after the first.
 
     Args:
-        index: (n,) places there of the tree's leaves.
+        index: (n,) places of the tree's leaves in `pending`.
         left: nodes without a parent before the tree was pruned, and the levels at which they merge next.
         numbers: (M,) of the families of the nodes of `final`.
-        sums: numbers of leaves and of merged nodes under all that is handed on.
+        sums: numbers of leaves and of merged nodes under all nodes that are handed on.
     """
     here = slice(1, final.first_child)
     splats, node, family = final.splats.take(here), final.order[here], numbers[here]
@@ -231,7 +231,7 @@ def _rest(
     own = family[merged] & ((1 << STAGE_BITS) - 1)
     nodes.rows[merged], nodes.rank[merged] = final.rows[own], final.ranks[own]
     nodes.size[merged] = spark_size(splats)[merged] / plan.curve.unit
-    # Whose parent was pruned merges again at the level of its size.
+    # A node whose parent was pruned merges again at the level of its size.
     nodes.level[:] = np.maximum(levels_of(nodes.size), plan.lowest)
     by_node = np.argsort(left[0])
     at = np.minimum(np.searchsorted(left[0], node, sorter=by_node), len(by_node) - 1)

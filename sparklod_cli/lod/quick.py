@@ -166,7 +166,7 @@ class VoxelGrid:
 
         Args:
             center, scale: (n, 3) of the splats.
-            order: (n,) the splats in the order of the scene; by default they are in it.
+            order: (n,) the splats in the order of the scene; None if they are in this order.
         """
         # One cell to spare at either end.
         edge = max(float((self.high - self.low).max()) / (2**CURVE_BITS - 2), float(self.steps[0]))
@@ -189,7 +189,7 @@ class NodeRows(NamedTuple):
         node: (n, WIDTH) float32 node rows of `kernels/pair_merge.py`.
         number: (n,) uint32 place of a given node among these; of a merged node, where its children begin, as a distance
             from the end of the final order.
-        children: (n,) uint16 number of children that it was given here; 0 for a given node.
+        children: (n,) uint16 number of children merged in this build; 0 for a given node.
     """
 
     node: FloatArray
@@ -204,14 +204,13 @@ class NodeRows(NamedTuple):
 class VoxelTree:
     """Nodes without a parent, and nodes with one in their final order.
 
-    Only nodes without a parent are worked on. A node that gets one is written to its place in the final order at once,
-    which is filled from its end: the last batch of merges, the coarsest one, comes first there. So a node takes memory
-    in one place at a time.
+    A node that gets a parent is written at once to its place in the final order, which is filled from its end: the last
+    batch of merges, the coarsest one, comes first there. So a node takes memory in one place at a time.
 
     Attributes:
-        rows: of the nodes without a parent; views of them do not outlive the next call.
-        batches: of merges that were done together, in their order: level of the cells; numbers of merged nodes,
-            and of their children; (families, words) Morton codes of the cells, the highest word first, empty in memory.
+        rows: rows of the nodes without a parent; views of them are invalid after the next call.
+        batches: merges of one level each, in their order: level of the cells; numbers of merged nodes and of their
+            children; (families, words) Morton codes of the cells, the highest word first, empty in memory.
     """
 
     def __init__(
@@ -302,7 +301,7 @@ class VoxelTree:
         return left + list(self._waiting.items())
 
     def _join(self, active: Nodes, more: int) -> tuple[Nodes, slice]:
-        """Add nodes, whose rows are to be filled; return where the active ones and they are. Others are forgotten."""
+        """Add nodes, whose rows are to be filled, and drop inactive ones; return places of active and added nodes."""
         active = self._tidy(active, more)
         part = slice(self._used, self._used + more)
         self._used, self._awaited = part.stop, self._awaited - more
@@ -324,7 +323,7 @@ class VoxelTree:
         rows.children[:] = 0
 
     def _tidy(self, active: Nodes, more: int = 0) -> Nodes:
-        """Make room for more nodes, and for what all of them are merged into; return where the active ones are."""
+        """Make room for more nodes and for the nodes that all merge into; return the places of active nodes."""
         need, size = len(active) + 2 * more, len(self.rows.number)
         if self._used + need <= size and self._used <= 2 * len(active) + more:
             return active
@@ -381,15 +380,15 @@ class VoxelTree:
     def finish(self, tops: NodeRows, given: Splats) -> tuple[Splats, LodTree, Nodes, Nodes]:
         """Return the nodes as they are drawn: those without a parent, then children of the batches, the last first.
 
-        Colours are merged here, where those of siblings are adjacent. The tree is of no use afterwards.
+        Colours are merged here, where those of siblings are adjacent. The tree is empty afterwards.
 
         Args:
             tops: the nodes without a parent.
             given: splats, as they are drawn.
 
         Returns:
-            M nodes; the children that they were given here; (M,) uint32 numbers of the given nodes, `MERGED` for
-            others; and (F,) uint32 the nodes with children, in the order of these.
+            M nodes; their children in this build; (M,) uint32 numbers of the given nodes, `MERGED` for others; and (F,)
+            uint32 nodes with children, in the order of their children.
         """
         self.rows = tops
         self._write(np.arange(len(tops.number), dtype=np.uint32))

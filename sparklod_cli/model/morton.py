@@ -12,8 +12,7 @@ from .splats import FloatArray
 #: Bits of a coordinate along each axis of the bounding box: three of them fill a word of 64 bits.
 BITS = 21
 
-#: How the bits of a word move apart, step by step, until two zeros stand between any two of them: by how many places,
-#: and which bits are kept.
+#: Steps that spread the bits of a word, until two zeros separate any two of them: shift, and mask of the result.
 _SPREADING = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
@@ -44,12 +43,8 @@ def order_of_cells(cells: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.intp]:
     """
     codes = np.zeros(len(cells), np.uint64)
     for axis in range(3):
-        codes |= _spread(cells[:, axis].astype(np.uint64)) << np.uint64(axis)
+        words = cells[:, axis].astype(np.uint64)
+        for places, mask in _SPREADING:
+            words = (words | words << np.uint64(places)) & np.uint64(mask)
+        codes |= words << np.uint64(axis)
     return np.argsort(codes, kind="stable")
-
-
-def _spread(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Return words of `BITS` bits with two zeros between any two of these."""
-    for places, kept in _SPREADING:
-        words = (words | words << np.uint64(places)) & np.uint64(kept)
-    return words

@@ -197,15 +197,6 @@ def test_the_inverse_undoes(transform: Transform) -> None:
 # What the numbers mean
 
 
-def test_euler_angles_turn_about_the_fixed_axes_x_first() -> None:
-    about_x, about_y, about_z = (Transform.from_euler(*np.eye(3)[axis] * 30) for axis in range(3))
-    np.testing.assert_array_equal(Transform.from_euler(90, 0, 0).rotation @ [0, 1, 0], [0, 0, 1])
-    np.testing.assert_array_equal(Transform.from_euler(0, 90, 0).rotation @ [0, 0, 1], [1, 0, 0])
-    np.testing.assert_array_equal(Transform.from_euler(0, 0, 90).rotation @ [1, 0, 0], [0, 1, 0])
-    both = about_x.then(about_y).then(about_z)
-    np.testing.assert_allclose(Transform.from_euler(30, 30, 30).rotation, both.rotation, atol=1e-15)
-
-
 @given(angles, angles, angles)
 def test_euler_angles_are_those_of_splat_transform(x: float, y: float, z: float) -> None:
     """The quaternion of PlayCanvas's `setFromEulerAngles`, by the product of its half angles."""
