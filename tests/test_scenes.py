@@ -311,18 +311,6 @@ def test_full_detail_of_trees_is_their_leaves() -> None:
     assert plain.scene.first_chunk == loaded.chunks
 
 
-def test_a_file_stands_in_several_places() -> None:
-    matrix = np.diag([2.0, 2.0, 2.0, 1.0])
-    matrix[:3, 3] = 7, 0, 0
-    scenes = read_scenes([Instance(HAND, "here"), Instance(HAND, "there", matrix)])
-    here, there = scenes.full().parts
-    assert here.scene is there.scene
-    assert here.splats is there.splats
-    centers = scenes.balls().center
-    assert np.allclose(centers[len(here.index) :], moved(here.splats.center, matrix), rtol=1e-6)
-    assert np.allclose(scenes.full().splats.center, centers, rtol=1e-6)
-
-
 def test_a_scene_in_memory_is_that_of_its_file() -> None:
     scene = read_scene(HAND)
     held, read = (read_scenes([Instance(source, "tree")]) for source in (scene, HAND))

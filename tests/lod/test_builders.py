@@ -177,21 +177,13 @@ def test_one_invalid_splat_fails_the_check(
         check_valid(splats, 2)
 
 
-@pytest.mark.parametrize(
-    ("column", "factor", "expected"),
-    [
-        ("opacity", 0, (True, False)),
-        ("scale", 0, (True, False)),
-        ("quat_xyzw", np.sqrt(1 + 0.8e-3), (False, True)),  # near the tolerance, which the definition decides on
-    ],
-)
-def test_invisible_or_slightly_long_rotations_are_valid(
-    column: str, factor: float, expected: tuple[bool, bool]
-) -> None:
+@pytest.mark.parametrize(("column", "factor"), [("opacity", 0), ("scale", 0), ("quat_xyzw", np.sqrt(1 + 0.8e-3))])
+def test_splats_that_fail_the_fast_check_alone_are_valid(column: str, factor: float) -> None:
+    """Invisible ones, and rotations near the tolerance, which the definition decides on."""
     splats = random_splats(9)
     getattr(splats, column)[4] *= np.float32(factor)
-    assert is_valid_and_visible(splats, 1)[0] == expected[0]
-    assert not all(is_valid_and_visible(splats, 1))
+    is_valid, is_visible = is_valid_and_visible(splats, 1)
+    assert is_valid == (column != "quat_xyzw") and not (is_valid and is_visible)
     check_valid(splats, 1)
 
 
@@ -320,12 +312,6 @@ def test_one_splat_many_times_makes_a_shallow_tree() -> None:
     """Half of what is equal merges in each round, so the tree is not a chain."""
     _, tree = build("quality", random_splats(1).take(np.zeros(10_000, np.int64)), 2.0)
     assert tree.depths().max() < 5 * math.log2(10_000)
-
-
-@pytest.mark.parametrize("growth", GROWTHS)
-def test_two_splats_have_one_parent(growth: float) -> None:
-    _, tree = build("quality", random_splats(2, sh_degree=1), growth)
-    assert tree.child_count.tolist() == [2, 0, 0]
 
 
 @pytest.mark.parametrize("growth", GROWTHS)
