@@ -156,10 +156,7 @@ def help(ctx: click.Context, command: str | None) -> None:
 
 
 @click.group(
-    cls=Sparklod,
-    epilog=EPILOG,
-    invoke_without_command=True,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    cls=Sparklod, epilog=EPILOG, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"]}
 )
 @click.version_option(__version__, package_name="sparklod")
 @click.pass_context

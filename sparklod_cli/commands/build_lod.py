@@ -44,8 +44,7 @@ from .option_groups import (
     JSON,
     OUTPUT,
     OVERWRITE,
-    POSITION,
-    SELECTION,
+    SCENE_HEADINGS,
     General,
     SceneOptions,
     bake_settings,
@@ -117,7 +116,7 @@ BY_DATE, VERIFY = "date", "verify"
 #: Headings of `--help`.
 TREE, REFINING, LARGE, CLUSTER = "Tree", "Refining", "Large scenes", "Cluster"
 DETAIL, TILED = DetailSettings.HEADING, TileSettings.HEADING
-HEADINGS = (COMMON, TREE, SELECTION, POSITION, FILE_FORMAT, "RAD", DETAIL, TILED, REFINING, LARGE, CLUSTER)
+HEADINGS = (COMMON, TREE, *SCENE_HEADINGS[1:], DETAIL, TILED, REFINING, LARGE, CLUSTER)
 
 
 @dataclass(frozen=True)
@@ -319,10 +318,7 @@ class BuildLodOptions:
 
 
 #: Options of earlier versions, and what to write instead.
-REPLACED = {
-    "--unlod": "sparklod convert IN OUT --leaves",
-    "--encoding": "sparklod convert IN OUT.npz --layout NAME",
-}
+REPLACED = {"--unlod": "sparklod convert IN OUT --leaves", "--encoding": "sparklod convert IN OUT.npz --layout NAME"}
 
 
 @click.command(

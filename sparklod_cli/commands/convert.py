@@ -18,11 +18,9 @@ from .command import COMMON, Command, flag, values_of
 from .console import Console, print_json
 from .option_groups import (
     EACH_AS_JSON,
-    FILE_FORMAT,
     JSON,
     OVERWRITE,
-    POSITION,
-    SELECTION,
+    SCENE_HEADINGS,
     General,
     SceneOptions,
     bake_settings,
@@ -89,10 +87,7 @@ class ConvertOptions:
     general: General = field(default_factory=General)
 
 
-HEADINGS = (COMMON, SELECTION, POSITION, FILE_FORMAT, "RAD")
-
-
-@click.command("convert", cls=Command, options=ConvertOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.command("convert", cls=Command, options=ConvertOptions, examples=EXAMPLES, headings=SCENE_HEADINGS)
 @click.pass_context
 def convert(ctx: click.Context, /, **_: Any) -> None:
     """Write the splats or the tree of IN in the format that the name of OUT chooses.

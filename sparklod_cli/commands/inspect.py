@@ -121,9 +121,7 @@ class InspectOutput:
     overwrite: bool = flag(**OVERWRITE)
     stats: bool = flag("Report statistics of all quantities, not only of the main ones.", heading=COMMON)
     field: str | None = setting(
-        "Print one value of the JSON report, such as tree.leaves, instead of a report.",
-        metavar="NAME",
-        heading=COMMON,
+        "Print one value of the JSON report, such as tree.leaves, instead of a report.", metavar="NAME", heading=COMMON
     )
     html: Path | None = setting(
         "Write the reports as one HTML page, with pictures.",

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 #: Headings of `--help` of options of scenes.
 SELECTION, POSITION, FILE_FORMAT = "Selection", "Rotation, scale and position", "File format"
+SCENE_HEADINGS = (COMMON, SELECTION, POSITION, FILE_FORMAT, "RAD")
 
 #: Largest accepted number of threads.
 MAX_THREADS = 256
@@ -454,8 +455,7 @@ class CutOptions:
     )
     cone_foveate: float = setting(f"Priority of nodes at the outer cone, {PRIORITY}.", FACTOR, CONE_FOVEATE)
     outside_foveate: float | None = setting(
-        "Priority of nodes outside the frustum, in place of the cones, as in Spark's LoD design.",
-        FACTOR,
+        "Priority of nodes outside the frustum, in place of the cones, as in Spark's LoD design.", FACTOR
     )
     behind_foveate: float | None = setting(
         f"Priority of nodes behind the camera.  [default: {BEHIND_FOVEATE:g}; 1 with --outside-foveate]", FACTOR

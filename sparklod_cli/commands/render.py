@@ -98,8 +98,7 @@ class PictureCut(CutOptions):
         " splats than the budget."
     )
     blend: float | None = setting(
-        f"With --continuous: ratio of the pixel scales between which nodes blend.  [default: {BLEND:g}]",
-        Range(above=1),
+        f"With --continuous: ratio of the pixel scales between which nodes blend.  [default: {BLEND:g}]", Range(above=1)
     )
 
 

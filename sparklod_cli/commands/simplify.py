@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -20,24 +20,14 @@ from ..system.errors import FormatError, SparklodError, naming
 from ..system.setting_fields import Quantity, Range, setting, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
-from .build_lod import (
-    BY_SIZE,
-    EXAMPLE_STEPS,
-    QUALITY,
-    BuildLodOptions,
-    exit_if_interrupted,
-    record_of,
-    report_baked,
-)
+from .build_lod import BY_SIZE, EXAMPLE_STEPS, QUALITY, BuildLodOptions, exit_if_interrupted, record_of, report_baked
 from .command import COMMON, Command, OptionalNumber, flag, values_of
 from .console import Console, print_json
 from .option_groups import (
     EACH_AS_JSON,
-    FILE_FORMAT,
     JSON,
     OVERWRITE,
-    POSITION,
-    SELECTION,
+    SCENE_HEADINGS,
     General,
     SceneOptions,
     bake_settings,
@@ -45,9 +35,6 @@ from .option_groups import (
 )
 from .outputs import NamedPath, Target, claim_stdout, keep_apart, name_outputs, shown
 from .rules import GOALS, check, flags_set
-
-if TYPE_CHECKING:
-    from ..bake.settings import BakeSettings
 
 EXAMPLES = """\
   sparklod simplify scene.ply --to 10% -o small.ply
@@ -123,30 +110,8 @@ class SimplifyOptions:
     as_json: bool = flag(EACH_AS_JSON, **JSON)
     general: General = field(default_factory=General)
 
-    def settings(self, ctx: click.Context, target: Target) -> BakeSettings:
-        """Return the settings of the bake whose tree is cut; loads numpy."""
-        from ..bake.simplifying import SimplifyGoal
 
-        return bake_settings(
-            ctx,
-            target.form,
-            self.scene,
-            self.written,
-            self.cluster_sh,
-            method=QUALITY,
-            growth=DETAIL_GROWTH,
-            max_sh=self.max_sh,
-            simplify=SimplifyGoal(self.to, self.max_bytes, self.psnr),
-            refine=None if self.refine is None else FitSettings(self.refine or None, self.seed, device=self.device),
-            camera_path=self.camera_path,
-            converts=True,
-        )
-
-
-HEADINGS = (COMMON, SELECTION, POSITION, FILE_FORMAT, "RAD")
-
-
-@click.command("simplify", cls=Command, options=SimplifyOptions, examples=EXAMPLES, headings=HEADINGS)
+@click.command("simplify", cls=Command, options=SimplifyOptions, examples=EXAMPLES, headings=SCENE_HEADINGS)
 @click.pass_context
 def simplify(ctx: click.Context, /, **_: Any) -> None:
     """Write a scene with fewer splats, the same for all cameras. Give one of --to, --max-bytes and --psnr.
@@ -162,8 +127,23 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.trees import bake_files, merged_source
         from ..bake.settings import Baked
+        from ..bake.simplifying import SimplifyGoal
 
-        settings = options.settings(ctx, target)
+        steps = options.refine
+        settings = bake_settings(
+            ctx,
+            target.form,
+            options.scene,
+            options.written,
+            options.cluster_sh,
+            method=QUALITY,
+            growth=DETAIL_GROWTH,
+            max_sh=options.max_sh,
+            simplify=SimplifyGoal(options.to, options.max_bytes, options.psnr),
+            refine=None if steps is None else FitSettings(steps or None, options.seed, device=options.device),
+            camera_path=options.camera_path,
+            converts=True,
+        )
         if options.to is not None and (question := doubt(options.to.count)):
             console.say(question)
         console.announce_compiling(settings)

@@ -41,8 +41,7 @@ from .outputs import NamedPath, claim_stdout, keep_apart, name_outputs
 from .rules import check
 
 if TYPE_CHECKING:
-    from ..simulation.results import FrameOutputs, Summary
-    from ..tables.assertions import Assertion
+    from ..simulation.results import Summary
     from ..tables.columns import Row
 
 #: Below this share of splats in front of the cameras, path and scene probably do not share their axes.
@@ -96,9 +95,7 @@ class TraverseOptions:
     indices_out: Path | None = setting(
         "Write the nodes of every cut to DIR, as .npy of uint32.", NamedPath(output=True, folder=True)
     )
-    padded: bool = flag(
-        "With --indices-out: pad each file to rows of 16,384 nodes, as Spark's index texture has them.",
-    )
+    padded: bool = flag("With --indices-out: pad each file to rows of 16,384 nodes, as Spark's index texture has them.")
 
     inputs: Inputs = field(default_factory=Inputs)
     cameras: Cameras = field(default_factory=Cameras)
@@ -108,22 +105,6 @@ class TraverseOptions:
         "Print the summary as one JSON object on standard output; write a table only to --output.", **JSON
     )
     general: General = field(default_factory=General)
-
-    def outputs(self, ctx: click.Context) -> FrameOutputs:
-        from ..simulation.results import COLUMNS, TIMING, FrameOutputs
-
-        columns = [each for each in COLUMNS if each.name not in TIMING or not self.no_timing]
-        table = table_output(self.output, columns, overwrite=self.overwrite, as_json=self.as_json, form=self.form)
-        if table.form is None:
-            check(ctx, table="none")
-        return FrameOutputs(table, self.indices_out, self.padded, self.plot, self.overwrite)
-
-    def assertions(self) -> list[Assertion]:
-        from ..simulation.results import COLUMNS, LOADING
-        from ..tables import assertions
-
-        with assert_errors():
-            return [assertions.parse(text, (*COLUMNS, *LOADING)) for text in self.asserts]
 
 
 HEADINGS = (COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Output")
@@ -150,8 +131,17 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     instances = options.inputs.instances()
     besides = files_read(options.cameras, instances)
     keep_apart(ctx, besides)
-    outputs = options.outputs(ctx)
-    asserts = options.assertions() if options.asserts else []
+    from ..simulation import results
+    from ..tables import assertions
+
+    columns = [each for each in results.COLUMNS if each.name not in results.TIMING or not options.no_timing]
+    table = table_output(
+        options.output, columns, overwrite=options.overwrite, as_json=options.as_json, form=options.form
+    )
+    check(ctx, table=table.form or "none")
+    outputs = results.FrameOutputs(table, options.indices_out, options.padded, options.plot, options.overwrite)
+    with assert_errors():
+        asserts = [assertions.parse(text, (*results.COLUMNS, *results.LOADING)) for text in options.asserts]
     start = time.perf_counter()
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.views import traverse_files
@@ -161,12 +151,10 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         if question := doubt(budget.count):
             console.say(question)
         console.announce_compiling("cuts")
-        screen = outputs.table.path is None and outputs.table.form is not None and is_terminal(sys.stdout)
+        screen = table.path is None and table.form is not None and is_terminal(sys.stdout)
         outputs.check()
-        columns = TRAVERSED if outputs.plot is None else COLUMNS
-        scenes = scenes_of(
-            options.cut, options.general, instances, console, columns=columns, trees_only=True, paged=True
-        )
+        held = TRAVERSED if outputs.plot is None else COLUMNS
+        scenes = scenes_of(options.cut, general, instances, console, columns=held, trees_only=True, paged=True)
         path = options.cameras.path(scenes)
         check_view(ctx, console, options.cameras, path, scenes(), options.streaming.network)
         keep_apart(ctx, {**besides, "indices_out": outputs.index_files(path.numbers, len(instances))})
@@ -179,14 +167,14 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
             outputs,
             by_instance=options.per_instance,
             asserts=asserts,
-            passed=for_screen if screen and outputs.table.form != "parquet" else None,
+            passed=for_screen if screen and table.form != "parquet" else None,
             threads=general.threads,
             progress=silent if screen else console.progress,  # a bar and a table do not go together on one screen
         )
         console.clear()
         console.detail(f"  {len(path.cameras):,} frames of {path.format}, {time.perf_counter() - start:.2f} s")
-        if outputs.table.path is not None:
-            console.say(f"{outputs.table.path}  table of {count_of(len(path.cameras), 'frame')}")
+        if table.path is not None:
+            console.say(f"{table.path}  table of {count_of(len(path.cameras), 'frame')}")
         if note:
             console.say(f"{outputs.plot}: {note}")
         if in_front < LEAST_IN_FRONT:
@@ -195,7 +183,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
                 f"warning: only {share} of the splats lie in front of the cameras; path and scene may"
                 " not share their axes (--camera-axes, --world-transform, --up)"
             )
-        on_stdout = outputs.table.form is None and not options.as_json
+        on_stdout = table.form is None and not options.as_json
         if options.as_json:
             print_json(whole.as_dict() | {"asserts": [each.as_dict() for each in outcomes]})
         if on_stdout and options.summary is not False:

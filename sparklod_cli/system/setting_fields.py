@@ -101,13 +101,7 @@ class Setting:
 
 
 def setting(
-    help: str,
-    kind: Any = None,
-    default: Any = None,
-    *,
-    name: str = "",
-    only_api: bool = False,
-    **attributes: Any,
+    help: str, kind: Any = None, default: Any = None, *, name: str = "", only_api: bool = False, **attributes: Any
 ) -> Any:
     """Return a dataclass field with a `Setting`, whose attributes the arguments are, and a default value."""
     declared = Setting(help, kind, name, only_api, attributes)
