@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..cameras.framing import Balls, balls_of
 from ..codecs.formats import PRECISIONS, RAD
+from ..codecs.losses import after
 from ..codecs.reader import Reader
 from ..io.local_files import size_of_input
 from ..io.opening import opened
@@ -24,7 +25,8 @@ from ..lod.budget import Budget
 from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix
 from ..model.lod_tree import CHUNK_NODES, LodTree
-from ..model.scene import Scene, common_axis, facts_of, rotated_axis
+from ..model.scene import DetailScene, Scene, TileScene, common_axis, facts_of, rotated_axis
+from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS, Splats
 from ..system.errors import FormatError, InvalidSplatsError, TreeError, UnfitError, memory_errors_translated, naming
 from ..system.progress import Progress, silent
@@ -48,7 +50,6 @@ from .spark import SparkViewer
 from .viewer_settings import PLAYCANVAS_BUDGET, LodSettings
 
 if TYPE_CHECKING:
-    from ..model.scene import DetailScene, TileScene
     from .continuous import BlendedCut, ContinuousCuts
     from .paging import Pages
 
@@ -378,7 +379,7 @@ def read_scenes(
             if scene.tree is None:
                 scene = _drawable(str(name), scene, notes)
             size = bytes_of(scene.splats) if file is None else size_of_input(file) or 0
-            drawn = scene.splats if through is None else _after(through, file, scene, threads)
+            drawn = scene.splats if through is None else after(through, file or Path(UNNAMED), scene, threads)
             entry: LoadedScene = LoadedScene(file, size, scene, drawn, chunks, precision, threads)
         else:
             from .paging import PagedScene, Pages
@@ -404,8 +405,6 @@ def _loaded_runs(
     file: Path | None, found: DetailScene | TileScene, through: str | None, chunks: int, threads: int
 ) -> LoadedScene:
     """Return all tiles, or all levels and the environment, as one scene with its files."""
-    from ..model.scene import DetailScene, TileScene
-
     splats = found.splats
     if isinstance(found, DetailScene) and found.environment is not None:
         degree = min(splats.sh_degree, found.environment.sh_degree)
@@ -413,7 +412,7 @@ def _loaded_runs(
     if not len(splats):
         raise InvalidSplatsError(f"{file or UNNAMED}: it has no splats")
     scene = Scene(splats, **facts_of(found))
-    drawn = splats if through is None else _after(through, file, scene, threads)
+    drawn = splats if through is None else after(through, file or Path(UNNAMED), scene, threads)
     if isinstance(found, TileScene):
         from .cesium import LoadedTiles
 
@@ -423,13 +422,6 @@ def _loaded_runs(
 
     files = files_in_memory(found) if file is None else read_detail_files(file)
     return LoadedDetail(file, int(files.sizes.sum()) + files.manifest, scene, drawn, chunks, detail=found, files=files)
-
-
-def _after(through: str, file: Path | None, scene: Scene, threads: int) -> Splats:
-    """Return the splats of a scene as they are after a coding."""
-    from ..codecs.losses import after
-
-    return after(through, file or Path(UNNAMED), scene, threads)
 
 
 def _read(
@@ -461,8 +453,6 @@ def _read(
 
 
 def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:
-    from ..model.selection import Selection, describe
-
     with naming(name, InvalidSplatsError):
         splats, dropped = Selection(drop_invalid=True).apply(scene.splats)
     if dropped:

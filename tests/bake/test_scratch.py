@@ -112,7 +112,7 @@ def test_selected_rows_are_those_of_the_whole_array(
         assert gap or store.read == 8 * len(index)
 
 
-def test_results_are_named_counted_and_removed(any_store: Store) -> None:
+def test_results_are_named_counted_and_removed(any_store: Store, tmp_path: Path) -> None:
     turned = np.arange(12).reshape(3, 4).T[::2]
     assert any_store.names() == []
     for name in ("stage/1", "stage/1/families", "survey/0"):
@@ -121,6 +121,9 @@ def test_results_are_named_counted_and_removed(any_store: Store) -> None:
         assert any_store.has(name)
     assert any_store.names() == ["stage/1", "stage/1/families", "survey/0"]
     assert any_store.written == 3 * len(data_of(any_store, "survey/0"))
+    folder = Store(tmp_path / "same")
+    folder.put("survey/0", ARRAYS | {"turned": turned})
+    assert data_of(any_store, "survey/0") == data_of(folder, "survey/0")
     assert any_store.read == 0
     copy = pickle.loads(packed := pickle.dumps(any_store))
     assert len(packed) < 500
@@ -135,15 +138,6 @@ def test_results_are_named_counted_and_removed(any_store: Store) -> None:
     assert not any_store.has("stage/1") and not any_store.is_sound("stage/1")
     with pytest.raises(ScratchError, match=r"stage/1 is missing in the scratch folder .*scratch: .*--overwrite"):
         any_store.get("stage/1")
-
-
-@pytest.mark.slow
-def test_a_store_at_an_address_has_the_bytes_of_a_folder(store: Store) -> None:
-    pytest.importorskip("fsspec")
-    remote = Store(Address(f"memory://{uuid.uuid4().hex}/scratch"))
-    for each in (store, remote):
-        each.put("x", ARRAYS)
-    assert data_of(store) == data_of(remote)
 
 
 def test_a_result_is_replaced(store: Store) -> None:

@@ -106,20 +106,6 @@ def test_a_file_waits_for_its_first_request_then_for_the_others_and_for_connecti
     assert ChunkStream(free, Network(100.0, 0.5)).complete_in([0]) == pytest.approx(11.0)
 
 
-def test_images_of_a_second_file_slow_down_those_of_the_first() -> None:
-    """Two files at a time: the large image of the first shares the bandwidth with all of the second."""
-    small, large = (10, 100, 1000), (10, 1000, 1000)
-    alone = Chunks([[small]], [()], rooted=False, fetchers=2, connections=6)
-    both = Chunks([[small, large]], [()], rooted=False, fetchers=2, connections=6)
-    one, two = ChunkStream(alone, Network(1000.0)), ChunkStream(both, Network(1000.0))
-    assert one.complete_in([0]) == pytest.approx(1.11)
-    two.want([0, 1])
-    while not two.take_arrivals():
-        two.step()
-    # 20 bytes of both first requests, then four transfers of 100 bytes each, then three of 900 bytes.
-    assert two.now == pytest.approx(0.02 + 0.4 + 2.7)
-
-
 @given(st.data(), tree_sizes, networks)
 def test_every_byte_comes_once_and_never_faster_than_the_link(
     data: st.DataObject, sizes: list[list[int]], network: Network
@@ -202,18 +188,6 @@ def test_with_more_bandwidth_a_resting_camera_waits_no_longer(
         assert fast <= slow * (1 + 1e-9)
 
 
-def test_a_wider_link_can_be_the_slower_one_by_a_little() -> None:
-    """Fetchers that fall into step wait together while the link is idle; the twin agrees."""
-    chunks = sized([[2, 50, 2, 5, 10, 2]])
-    for bandwidth, expected in ((2.0, 87.5), (2.2, 88.1818)):
-        network = Network(bandwidth, 20, 2)
-        twin = Twin(chunks, network, NaiveCache(None))
-        twin.want([0, 1, 2, 3, 4, 5])
-        twin.advance(Fraction(1000))
-        assert float(twin.arrivals[-1][0]) == pytest.approx(expected, abs=1e-4)
-        assert ChunkStream(chunks, network).complete_in([0, 1, 2, 3, 4, 5]) == pytest.approx(expected, abs=1e-4)
-
-
 @given(st.data(), tree_sizes, networks)
 def test_one_fetcher_brings_them_in_order_one_after_the_other(
     data: st.DataObject, sizes: list[list[int]], network: Network
@@ -269,40 +243,6 @@ def test_transfers_share_the_link() -> None:
     # 1 and 3 MB together at 1 MB/s: the small one has half of it and ends after 2 s, the large one after 4 s.
     stream = ChunkStream(sized([[1 * MB], [3 * MB]]), Network(1 * MB, 1.0))
     assert arrivals_at_rest(stream) == [(pytest.approx(3.0), 0), (pytest.approx(5.0), 1)]
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 6, 8])
-@pytest.mark.parametrize("fetchers", [1, 3, 4])
-def test_equal_chunks_come_in_rounds(count: int, fetchers: int) -> None:
-    rounds, remainder = divmod(count, fetchers)
-    expected = rounds * (0.1 + fetchers * 0.5) + (0.1 + remainder * 0.5 if remainder else 0)
-    stream = ChunkStream(sized([[MB] * count]), Network(2 * MB, 0.1, fetchers))
-    assert stream.complete_in(list(range(count))) == pytest.approx(expected)
-
-
-def test_fetches_are_not_cancelled_when_the_camera_turns() -> None:
-    stream = ChunkStream(sized([[MB] * 5]), Network(MB, 0.5, 1))
-    stream.want([])
-    stream.advance(1.5)
-    stream.want([1, 2])
-    stream.advance(2.5)
-    stream.want([3, 4])  # while 1 is under way
-    stream.advance(6.0)
-    assert stream.take_arrivals() == [0, 1, 3, 4]
-    assert resident(stream.cache) == {0, 1, 3, 4}
-
-
-def test_a_late_chunk_evicts_no_wanted_one() -> None:
-    stream = ChunkStream(sized([[MB] * 4]), Network(MB, 0.25, 1), capacity=2)
-    stream.want([1])
-    stream.advance(3.0)
-    stream.want([2])
-    stream.advance(3.5)
-    stream.want([1])  # while 2 is under way
-    stream.advance(9.0)
-    assert stream.complete_in([2]) == pytest.approx(1.25)  # it would have to come again
-    assert stream.take_arrivals() == [0, 1, 2]  # its bytes have been spent
-    assert resident(stream.cache) == {0, 1}
 
 
 @given(st.data(), tree_sizes)
