@@ -57,9 +57,6 @@ class Camera:
             eye, target: x, y, z in world units.
             up: x, y, z of what is up in the picture; -y in scenes as training leaves them.
             fov_y: vertical field of view, degrees.
-            size: width and height of the image, pixels.
-            time: seconds since the start of its path.
-            name: of its frame, for display.
 
         Raises:
             CameraPathError: eye and target are the same point, or a number is out of its range.
@@ -240,9 +237,7 @@ class Intrinsics:
     """Intrinsics of a camera in a file; None for those that the file does not have.
 
     Attributes:
-        size: width and height, pixels.
         focal: fx, fy in pixels; only used together with a size.
-        principal: cx, cy in pixels.
         fov: field of view in radians, used without a focal length.
         fov_along: side of the image that `fov` spans: "x", "y" or "longer".
     """

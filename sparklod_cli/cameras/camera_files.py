@@ -78,7 +78,6 @@ class Parsed:
     Attributes:
         frames: in order; or a function that computes frames between keys from their numbers.
         notes: what was ignored or assumed, one sentence each, for display.
-        fps: frames a second in the file; None if it gives none.
         turned: every camera has its own up axis.
         count: number of frames that are computed, rounded up and at least one.
     """
@@ -181,14 +180,9 @@ LARGEST = 1 << 31
 
 
 def read(files: Files, *, format: str | None = None, settings: Settings | None = None) -> CameraPath:
-    """Return the cameras of a file.
+    """Return the cameras of a file; `format` is the name of a row of `FORMATS`, None to recognize it by the content.
 
-    Args:
-        files: the file, and those that belong to it.
-        format: name of a row of `FORMATS`; None recognizes the format by the content.
-
-    Raises:
-        CameraPathError: the file has no known format or is broken, or a camera makes no sense.
+    `CameraPathError` if the file has no known format or is broken, or a camera makes no sense.
     """
     settings = settings or Settings()
     if not any(files.contents.values()):

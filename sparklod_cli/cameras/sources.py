@@ -109,10 +109,8 @@ def cameras_of(
 
     Args:
         frames: all of them; or a function of (K,) numbers of frames, as a few keys can yield any number of them.
-        title: origin of the frames, for display.
         axes: of frames without their own, unless settings have some.
         count: number of frames, rounded up and at least one, where a function computes them.
-        fps: frames a second of the file; None if it gives none.
 
     Raises:
         CameraPathError: there are no cameras, or one makes no sense, which the text names; its subclass
@@ -199,12 +197,9 @@ def _frames_around(center: ArrayLike, distance: Matrix, turn: Matrix, elevation:
 def orbit(
     count: int, center: Point | None, distance: float | None, elevation: float, settings: Settings, scene: Scene
 ) -> CameraPath:
-    """Return cameras once around a scene.
+    """Return cameras once around a point, the middle of the scene if None.
 
-    Args:
-        center: what they look at; None for the middle of the scene.
-        distance: from there, world units; None for where the scene fits the image.
-        elevation: above there, degrees.
+    `distance` from there is in world units, None for where the scene fits the image; `elevation` in degrees.
     """
     up, tilt = settings.up_axis, math.radians(elevation)
     frames = functools.partial(orbit_frames, count=count, elevation=tilt, up=up)
@@ -218,12 +213,9 @@ def orbit(
 def dolly(
     seconds: float, center: Point | None, distance: float | None, elevation: float, settings: Settings, scene: Scene
 ) -> CameraPath:
-    """Return cameras straight towards a scene, from far to near.
+    """Return cameras straight towards a point, from far to near; `center` and `elevation` as in `orbit`.
 
-    Args:
-        center: what they look at; None for the middle of the scene.
-        distance: of the first camera from there, world units; None for 4 times where the scene fits the image.
-        elevation: above there, degrees.
+    `distance` is that of the first camera, world units, None for 4 times that at which the scene fits the image.
     """
     up, tilt = settings.up_axis, math.radians(elevation)
     count = max(2, round(seconds * (settings.fps or DEFAULT_FPS)))
@@ -245,9 +237,7 @@ def _aim(
 ) -> tuple[Point, float]:
     """Return the target of cameras, (3,), and their distance from there; both are chosen for the scene where None.
 
-    Args:
-        frames: of the cameras, at any distance.
-        times: factor of a chosen distance over that at which the scene just fits the image.
+    The cameras of `frames` may be at any distance; a chosen one is `times` that at which the scene just fits the image.
     """
     visible = framing.covered(scene())
     target = framing.middle_of(visible) if center is None else np.asarray(center, np.float64)
@@ -319,14 +309,8 @@ def between(
     between them. The parameter of the spline is time. Keys without times are spaced centripetally, by the square roots
     of the distances between them (Yuksel, Schaefer and Keyser 2011), which avoids loops and cusps.
 
-    Args:
-        fps: frames a second; None for `DEFAULT_FPS`.
-        up: (3,) up axis of keys without one.
-        lens: of keys without a field of view.
-        seconds: mean time from key to key, if keys have no times.
-
-    Raises:
-        CameraPathError: there are fewer than two keys, or too many frames; times are missing, or do not increase.
+    `up` and `lens` are those of keys without; `seconds` is the mean time from key to key, if keys have no times.
+    `CameraPathError` if there are fewer than two keys, some times are missing, or they do not increase.
     """
     rate = fps or DEFAULT_FPS
     if len(keys) < 2:

@@ -119,12 +119,8 @@ def _curve(
 ) -> Callable[[Matrix], Matrix]:
     """Return the interpolation between keys.
 
-    Args:
-        times: (n,) of the keys, frames.
-        points: (n, 7).
-        smoothness: from 0, straight lines between keys, to 1.
-        length: of a path that is a loop, frames; None for another path.
-        step: hold each key until the next.
+    `times`, (n,), and `length`, None for a path that is no loop, are in frames; `smoothness` is 0 for straight lines
+    between the `points`, (n, 7), to 1; `step` holds each key until the next.
     """
     if not len(times):
         raise CameraPathError("it has no keyframes")

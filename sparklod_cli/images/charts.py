@@ -381,7 +381,9 @@ def plot(
     lines = [(_about(frames), FAINT)]
     if marked:
         lines.append((", ".join(f"{CALLED[reason]}: frame {number:,}" for reason, number in marked.items()), PINK))
-    images: list[Any] = [head(_one_line(title), lines, 96 + 26 * len(lines)), draw_charts(frames, marked)]
+    title = "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in title)
+    title = title if len(title) <= 100 else f"{title[:99]}…"
+    images: list[Any] = [head(title, lines, 96 + 26 * len(lines)), draw_charts(frames, marked)]
     note = None
     if scene is not None:
         try:
@@ -406,11 +408,6 @@ def _about(frames: Sequence[Row]) -> str:
             f"a budget of {' to '.join(f'{each:,}' for each in dict.fromkeys([budgets[0], budgets[-1]]))} splats"
         )
     return ", ".join(said)
-
-
-def _one_line(text: str) -> str:
-    plain = "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in text)
-    return plain if len(plain) <= 100 else f"{plain[:99]}…"
 
 
 def draw_charts(rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.uint8]:

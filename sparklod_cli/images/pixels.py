@@ -46,10 +46,7 @@ def font(unit: float, size: float) -> Font:
 def write_title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Sequence[tuple[str, str]]) -> None:
     """Write a title, and lines below it, at the upper left of a picture.
 
-    Args:
-        unit: pixels in a thousandth of the picture's height; 1 for a picture of 1600 x 1000.
-        title: cut to `MAX_TITLE` characters.
-        lines: text and colour of each; not cut.
+    `unit` is a thousandth of the picture's height, pixels; `lines` are texts and their colours.
     """
     left, top = 40 * unit, 30 * unit
     draw.text((left, top), printable(title, MAX_TITLE), INK, font(unit, 32))

@@ -156,9 +156,7 @@ def viewpoint(
 ) -> Viewpoint:
     """Return the viewpoint that looks along a direction and just fits all points into a frame.
 
-    Args:
-        direction, up: (3,) world axes.
-        frame: left, top, right and bottom of the frame in the picture, 0..1 from the left and from the top.
+    `frame` is its left, top, right and bottom in the picture, 0..1 from the left and from the top.
     """
     angle = 25.0
     forward = direction / np.linalg.norm(direction)
@@ -224,13 +222,7 @@ def write_png(
     low: Points,
     high: Points,
 ) -> bytes:
-    """Return the PNG of a picture with title, colour scale and axes.
-
-    Args:
-        pixels: (H, W, 3) of the scene.
-        title, lines: texts for the upper left corner, which must fit into the width.
-        low, high: (3,) corners of the box along whose edges the axes run, world units.
-    """
+    """Return the PNG of a picture, (H, W, 3), with title, colour scale, and axes along the edges of a box."""
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image)
     unit = min(image.height / 1000, image.width / 1600)

@@ -41,10 +41,8 @@ class PictureSettings:
 
     Attributes:
         background: red, green and blue, 0..1, behind the splats; None keeps alpha.
-        bar: add a colour bar to a picture whose colours encode a quantity.
         gain: factor by which differences are multiplied; None chooses one from the pictures.
-        jobs: number of pictures to process concurrently.
-        threads: number of threads of the kernels.
+        jobs: number of pictures drawn at the same time, with `threads` each.
     """
 
     background: Color | None = None
@@ -86,15 +84,8 @@ def write_pictures(
 ) -> WrittenPictures:
     """Render and write the pictures of a camera path.
 
-    Args:
-        path: the cameras; all of one size for an animation or a contact sheet.
-        reference: cuts to compare with; the pictures are then differences from it.
-
-    Raises:
-        BackendError: the backend cannot draw here.
-        OutputError: a file cannot be written.
-        SparklodError: the quantity to colour by is missing, the reference covers no pixel of a frame, or an animation
-            cannot be encoded here.
+    Cameras of an animation or a contact sheet have one size. With a `reference`, pictures are differences from it;
+    `SparklodError` if it covers no pixel of a frame, or as by `Renderer` and `animate`.
     """
     facts: list[dict[str, Any]] = []
     count, size, empty = len(path.cameras), 0, True

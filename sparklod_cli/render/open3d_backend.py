@@ -127,9 +127,7 @@ def pieces(
 def _split(camera: Camera, low: Array, high: Array, most: int) -> Iterator[tuple[Square, NDArray[np.intp], int]]:
     """Yield squares that cover the splats of a picture: each with its splats, and its pairs of splat and tile.
 
-    Args:
-        low, high: (N, 2) the corners of boxes around splats, pixels.
-        most: maximum number of pairs in a square of more than one tile.
+    `low` and `high`, (N, 2), are corners of boxes around splats, pixels. A square has at most `most` pairs, or one tile.
     """
     squares = [(x, y, PIECE) for y in range(0, camera.height, PIECE) for x in range(0, camera.width, PIECE)]
     waiting = [(square, np.arange(len(low))) for square in reversed(squares)]

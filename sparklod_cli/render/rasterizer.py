@@ -109,9 +109,7 @@ def sort_into_tiles(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """List the splats of each tile, from near to far.
 
-    Args:
-        across, down: numbers of tiles.
-        blocks: number of ranges of splats that threads process; the result does not depend on it.
+    Threads process `blocks` ranges of splats, on which the result does not depend.
 
     Returns:
         (tiles + 1,) where the splats of each tile begin; (total,) splats.

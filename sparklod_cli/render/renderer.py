@@ -55,16 +55,8 @@ class DrawnPicture:
 class Renderer:
     """Draws pictures with the same settings; several threads may use it.
 
-    Args:
-        cameras: all that will be drawn; a color scale is the same in all of their pictures.
-
-    Attributes:
-        scale: the color scale; None where splats have their own colours.
-
-    Raises:
-        SparklodError: the scenes lack the quantity to colour by.
-        BackendError: the device is a card, and none is usable.
-        ValueError: the device is a card, and the backend does not draw on one.
+    Pictures of all `cameras` share the color scale `scale`, None where splats have their own colours. `SparklodError`
+    if the scenes lack the quantity to colour by; `BackendError` if the device is a card, and none is usable.
     """
 
     def __init__(

@@ -63,12 +63,7 @@ Log = Callable[[str], None]
 
 
 class Server(ThreadingHTTPServer):
-    """Serves a site, a thread for each connection; `SparklodError` if it cannot listen there.
-
-    Args:
-        host: name or address to listen on.
-        port: to listen on; 0 for any that is free.
-    """
+    """Serves a site, a thread for each connection; port 0 is any free one; `SparklodError` if it cannot listen."""
 
     daemon_threads = True
     block_on_close = False

@@ -291,11 +291,9 @@ class Start:
     """The first view of the scene.
 
     Attributes:
-        eye, target: of the camera, world units.
         fov: vertical field of view, degrees.
-        center: the middle of the scene, world units.
-        radius: of a ball around the middle that most splats are in, world units.
-        sizes: the range of the feature sizes, smallest and largest, world units.
+        radius: of a ball around `center` that most splats are in, world units.
+        sizes: smallest and largest feature size, world units.
         chosen: the view was chosen for the scene, not given.
     """
 

@@ -32,9 +32,6 @@ from sparklod_cli.cameras.sources import (
     Key,
     between,
     cameras_of,
-    catmull_rom_tangents,
-    centripetal_knots,
-    hermite,
 )
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.render_settings import RasterSettings
@@ -66,16 +63,6 @@ def test_a_matrix_has_the_axes_of_the_option_or_of_the_file(axes: Axes) -> None:
         assert camera.position.tolist() == [1, 2, 3]
         assert camera.forward.tolist() == [0, 0, 1]
         assert camera.camera_to_world[:3, 1].tolist() == [0, -1, 0]
-
-
-def test_axes_of_a_file_can_be_overridden_but_cameras_with_a_target_take_none() -> None:
-    turned = read_fixture("tum.txt", Settings(axes=Axes.OPENGL_C2W)).cameras[1]
-    assert np.allclose(turned.forward, -np.array(KNOWN[1].ahead))
-    assert np.allclose(turned.position, KNOWN[1].position)
-    with pytest.raises(CameraPathError, match="--camera-axes cannot be used with it"):
-        read_fixture("supersplat-v2.json", Settings(axes=Axes.OPENCV_C2W))
-    frames = [{"eye": [0, 0, -5], "target": [0, 0, 0]}]
-    assert own(Settings(axes=Axes.OPENCV_W2C), frames=frames).cameras[0].forward.tolist() == [0, 0, 1]
 
 
 def test_a_world_is_turned_scaled_and_moved() -> None:
@@ -344,16 +331,6 @@ def test_a_path_passes_its_keyframes_without_jumps() -> None:
     assert max(fovs) == pytest.approx(math.radians(80)), "no overshooting"
 
 
-def test_keyframes_in_one_place_turn_the_camera() -> None:
-    keys = [Key((0.0, 0.0, 0.0), (math.sin(a), 0.0, math.cos(a))) for a in (0, 1, 1.5)]
-    frames = moved(keys, 30, DEFAULT_UP)
-    assert np.allclose(positions(frames), 0)
-    assert np.allclose(aheads(frames)[-1], (math.sin(1.5), 0, math.cos(1.5)))
-    same = moved([keys[0], keys[0]], 10, DEFAULT_UP)
-    assert len(same) == 21
-    assert np.allclose(aheads(same), (0, 0, 1))
-
-
 def test_keyframes_without_a_lens_keep_the_given_one() -> None:
     lens = Intrinsics((640, 480), (600, 610), (300, 200))
     keys = [Key(key.eye, key.target) for key in KEYS]
@@ -377,18 +354,6 @@ def test_keyframe_times_that_do_not_rise_or_are_far_apart_are_refused(
     keys = [Key(key.eye, key.target, time=time) for key, time in zip(KEYS, times, strict=False)]
     with pytest.raises(CameraPathError, match=said):
         moved(keys, 30, DEFAULT_UP)
-
-
-def test_centripetal_splines_make_no_loop() -> None:
-    """Two near points between far ones: evenly spaced knots would overshoot them, and come back."""
-    points = np.array([[-10.0, 0], [0, 0], [0.1, 0], [0.1, 10]])
-    at = np.linspace(0, 1, 2001)
-
-    def curve(knots: NDArray[np.float64]) -> NDArray[np.float64]:
-        return hermite(knots, points, catmull_rom_tangents(knots, points), at * knots[-1])
-
-    assert np.diff(curve(centripetal_knots(points))[:, 0])[:1000].min() > -1e-12
-    assert curve(np.arange(4.0))[:, 0].max() > 0.5
 
 
 # Framing: cameras that have a scene in view

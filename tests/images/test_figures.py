@@ -186,12 +186,6 @@ def test_levels_without_pixel_scales_are_detail_levels(limit: float | None, said
 
 
 @needs_charts
-def test_a_chart_leaves_single_instances_out() -> None:
-    rows = flight(20)
-    assert plotted([*rows, *(each | {"instance": "tree"} for each in rows)], "a") == plotted(rows, "a")
-
-
-@needs_charts
 def test_a_matplotlibrc_changes_nothing() -> None:
     import matplotlib
 
@@ -297,17 +291,6 @@ def test_frusta_are_what_the_camera_sees() -> None:
 # Geometry of scenes in PyVista
 
 
-@pytest.mark.parametrize(("rounds", "points", "triangles"), [(0, 12, 20), (1, 42, 80), (2, 162, 320)])
-def test_a_sphere_is_closed_and_faces_outwards(rounds: int, points: int, triangles: int) -> None:
-    sphere = pyvista_scene.sphere(rounds)
-    assert (len(sphere.points), len(sphere.triangles)) == (points, triangles)
-    assert np.allclose(np.linalg.norm(sphere.points, axis=1), 1)
-    p, q, r = sphere.points[sphere.triangles].transpose(1, 0, 2)
-    assert (np.einsum("ij,ij->i", np.cross(q - p, r - p), p) > 0).all()  # all faces look outwards
-    edges = np.sort(sphere.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()  # and it is closed
-
-
 def test_ellipsoids_are_where_the_gaussian_says_and_not_thinner_than_a_pixel() -> None:
     splats = random_splats(30)
     of = pyvista_scene.sphere(1)
@@ -345,19 +328,6 @@ def test_cells_are_the_corners_of_occupied_cubes_and_a_box_has_twelve_edges() ->
     assert pyvista_scene.cells(center, 0.5).tolist() == [[0, 0, -0.5], [0.5, 0, -0.5]]
     lines = pyvista_scene.box_lines(np.array([[1.0, 2, 3]]), np.array([[2.0, 4, 6]])).reshape(12, 2, 3)
     assert sorted(np.abs(np.diff(lines, axis=1)).sum(axis=(1, 2)).tolist()) == [1] * 4 + [2] * 4 + [3] * 4
-
-
-def test_wall_lines_are_at_multiples_of_the_step() -> None:
-    low, high = np.array([-1.1, 0.2, 5.0]), np.array([1.1, 0.9, 6.0])
-    lines = pyvista_scene.wall_lines(low, high, np.array([-1.1, 0.9, 5.0]), 0.5).reshape(-1, 2, 3)
-    assert len(lines) == 2 * (5 + 1 + 3)
-    assert (lines >= low).all()
-    assert (lines <= high).all()
-    for ends in lines:
-        (along,) = np.flatnonzero(ends[0] != ends[1])
-        others = {axis: ends[0, axis] for axis in {0, 1, 2} - {along}}
-        assert any(np.isclose(value % 0.5, 0) for value in others.values())
-        assert any(value == (-1.1, 0.9, 5.0)[axis] for axis, value in others.items())
 
 
 @pytest.mark.parametrize("aspect", [0.5, 1.6, 3])
@@ -402,14 +372,6 @@ def test_colors_tell_sizes_apart() -> None:
     places = [place for place, _ in coloring.marks]
     assert len(places) > 3
     assert 0 <= min(places) <= max(places) <= 1
-
-
-def test_equal_splats_have_one_color() -> None:
-    splats = random_splats(5).take(np.zeros(5, np.int64))
-    for by in ("size", "opacity", "chunk"):
-        coloring, rgb = color_by(by, splats, np.arange(5), None)
-        assert len(np.unique(rgb, axis=0)) == 1
-        assert coloring.marks
 
 
 def test_every_level_has_a_colour_and_a_mark() -> None:
