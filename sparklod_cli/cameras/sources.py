@@ -156,29 +156,6 @@ def cameras_of(
 DOLLY_START, DOLLY_ZOOM = 4.0, 16.0
 
 
-def orbit_frames(
-    numbers: Numbers, count: int, center: ArrayLike, distance: float, elevation: float, up: ArrayLike
-) -> list[Frame]:
-    """Return frames, by (K,) numbers, of `count` once around a point, (3,), counter-clockwise seen from above.
-
-    `distance` is in world units, `elevation` an angle above the point, radians, `up` the (3,) axis of the orbit.
-    """
-    turn = 2 * math.pi * numbers / count
-    return _frames_around(center, np.full(len(numbers), distance), turn, elevation, up)
-
-
-def dolly_frames(
-    numbers: Numbers, count: float, center: ArrayLike, far: float, near: float, elevation: float, up: ArrayLike
-) -> list[Frame]:
-    """Return frames, by (K,) numbers, of `count`, at least 2, straight towards a point.
-
-    It grows by the same factor from frame to frame. `far` and `near` are distances of the first and the last frame,
-    world units; `center`, `elevation` and `up` as in `orbit_frames`.
-    """
-    away = far * (near / far) ** (numbers / (count - 1))
-    return _frames_around(center, away, np.zeros(len(numbers)), elevation, up)
-
-
 def _frames_around(center: ArrayLike, distance: Matrix, turn: Matrix, elevation: float, up: ArrayLike) -> list[Frame]:
     """Return N frames that look at a point, (3,), from (N,) distances, turned by (N,) radians from its front.
 
@@ -202,10 +179,14 @@ def orbit(
     `distance` from there is in world units, None for where the scene fits the image; `elevation` in degrees.
     """
     up, tilt = settings.up_axis, math.radians(elevation)
-    frames = functools.partial(orbit_frames, count=count, elevation=tilt, up=up)
+
+    def frames(numbers: Numbers, center: Point, distance: float) -> list[Frame]:
+        turn = 2 * math.pi * numbers / count
+        return _frames_around(center, np.full(len(numbers), distance), turn, tilt, up)
+
     if center is None or distance is None:
         some = np.arange(0, count, -(-count // framing.CAMERAS))
-        center, distance = _aim(frames(some, center=(0.0, 0.0, 0.0), distance=1), center, distance, settings, scene)
+        center, distance = _aim(frames(some, (0.0, 0.0, 0.0), 1), center, distance, settings, scene)
     around = functools.partial(frames, center=center, distance=distance)
     return cameras_of(around, settings, "an orbit", count=count)
 
@@ -219,11 +200,15 @@ def dolly(
     """
     up, tilt = settings.up_axis, math.radians(elevation)
     count = max(2, round(seconds * (settings.fps or DEFAULT_FPS)))
-    frames = functools.partial(dolly_frames, elevation=tilt, up=up)
     if center is None or distance is None:
-        ahead = frames(np.arange(2), 2, center=(0.0, 0.0, 0.0), far=1, near=1)
+        ahead = _frames_around((0.0, 0.0, 0.0), np.ones(1), np.zeros(1), tilt, up)
         center, distance = _aim(ahead, center, distance, settings, scene, DOLLY_START)
-    towards = functools.partial(frames, count=count, center=center, far=distance, near=distance / DOLLY_ZOOM)
+
+    def frames(numbers: Numbers, center: Point, far: float) -> list[Frame]:
+        away = far * (1 / DOLLY_ZOOM) ** (numbers / (count - 1))  # the scene grows by one factor a frame
+        return _frames_around(center, away, np.zeros(len(numbers)), tilt, up)
+
+    towards = functools.partial(frames, center=center, far=distance)
     return cameras_of(towards, settings, "a dolly", count=count)
 
 

@@ -127,7 +127,7 @@ def pieces(
 def _split(camera: Camera, low: Array, high: Array, most: int) -> Iterator[tuple[Square, NDArray[np.intp], int]]:
     """Yield squares that cover the splats of a picture: each with its splats, and its pairs of splat and tile.
 
-    `low` and `high`, (N, 2), are corners of boxes around splats, pixels. A square has at most `most` pairs, or one tile.
+    `low` and `high`, (N, 2), are corners of boxes around splats, pixels. A square of several tiles has at most `most`.
     """
     squares = [(x, y, PIECE) for y in range(0, camera.height, PIECE) for x in range(0, camera.width, PIECE)]
     waiting = [(square, np.arange(len(low))) for square in reversed(squares)]

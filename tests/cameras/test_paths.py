@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras import sources
-from sparklod_cli.cameras.camera import DEFAULT_UP, Camera, Frame, Intrinsics, Settings, camera_of, look_at
+from sparklod_cli.cameras.camera import DEFAULT_UP, Camera, Frame, Intrinsics, Settings, look_at
 from sparklod_cli.cameras.camera_files import read
 from sparklod_cli.cameras.camera_formats import Axes
 from sparklod_cli.cameras.framing import (
@@ -45,6 +45,14 @@ def own(settings: Settings | None = None, **root: Any) -> CameraPath:
 
 def with_matrix(matrix: NDArray[np.float64], **root: Any) -> Camera:
     return own(frames=[{"matrix": matrix.tolist()}], **root).cameras[0]
+
+
+def no_scene() -> Balls:
+    raise AssertionError("the scene has no influence")
+
+
+def orbited(count: int, center: Any, distance: float, degrees: float, **settings: Any) -> CameraPath:
+    return sources.orbit(count, center, distance, degrees, Settings(**settings), no_scene)
 
 
 @pytest.mark.parametrize("axes", Axes)
@@ -182,7 +190,7 @@ def test_times_come_from_the_file_or_from_frames_a_second() -> None:
     assert [camera.time for camera in path] == [0, 4, 8]
     assert [camera.time for camera in own(Settings(every=2, fps=10), frames=frames)] == pytest.approx([0, 0.2, 0.4])
     assert "do not increase" in own(frames=frames[::-1]).notes[0]
-    orbit = cameras_of(sources.orbit_frames(np.arange(4), 4, (0, 0, 0), 1, 0, DEFAULT_UP), Settings(fps=2), "an orbit")
+    orbit = orbited(4, (0, 0, 0), 1, 0, fps=2)
     assert [camera.time for camera in orbit] == [0, 0.5, 1, 1.5]
     assert (orbit.format, orbit.notes) == ("an orbit", ())
 
@@ -273,30 +281,30 @@ def aheads(frames: list[Frame]) -> NDArray[np.float64]:
 @pytest.mark.parametrize("up", [(0, -1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 0), (1, 2, 3)])
 def test_an_orbit_goes_around_once_and_looks_inwards(up: tuple[float, float, float]) -> None:
     center, distance, elevation = np.array([1.0, 2.0, 3.0]), 5.0, math.radians(30)
-    frames = sources.orbit_frames(np.arange(12), 12, center, distance, elevation, up)
-    offsets = positions(frames) - center
+    path = orbited(12, center, distance, 30, up=up)
+    offsets = np.array([camera.position for camera in path]) - center
     axis = np.array(up) / np.linalg.norm(up)
     assert np.allclose(np.linalg.norm(offsets, axis=1), distance)
     assert np.allclose(offsets @ axis, distance * math.sin(elevation))
-    assert np.allclose(aheads(frames), -offsets / distance)
+    assert np.allclose([camera.forward for camera in path], -offsets / distance)
     around = offsets - (offsets @ axis)[:, None] * axis
     turns = np.cross(around, np.roll(around, -1, axis=0)) @ axis
     assert np.allclose(turns, (distance * math.cos(elevation)) ** 2 * math.sin(2 * math.pi / 12)), "to the left, evenly"
-    assert all(frame.matrix[:3, 1] @ axis > 0 for frame in frames)
+    assert all(camera.camera_to_world[:3, 1] @ axis > 0 for camera in path)
 
 
 @pytest.mark.parametrize(("up", "front"), [((0, -1, 0), (0, 0, -1)), ((0, 1, 0), (0, 0, 1)), ((0, 0, 1), (0, -1, 0))])
 def test_a_scene_is_first_seen_from_its_front(up: tuple[float, ...], front: tuple[float, ...]) -> None:
-    assert np.allclose(positions(sources.orbit_frames(np.arange(4), 4, (0, 0, 0), 2, 0, up))[0], 2 * np.array(front))
-    assert np.allclose(positions(sources.dolly_frames(np.arange(4), 4, (0, 0, 0), 2, 1, 0, up))[0], 2 * np.array(front))
+    dolly = sources.dolly(1, (0, 0, 0), 2, 0, Settings(up=up), no_scene)
+    for path in (orbited(4, (0, 0, 0), 2, 0, up=up), dolly):
+        assert np.allclose(path[0].position, 2 * np.array(front))
 
 
 def test_distances_of_a_dolly_have_one_ratio() -> None:
-    frames = sources.dolly_frames(np.arange(9), 9, (1, 1, 1), 16.0, 1.0, math.radians(20), DEFAULT_UP)
-    distances = np.linalg.norm(positions(frames) - 1, axis=1)
-    assert distances[[0, -1]] == pytest.approx([16, 1])
-    assert np.allclose(distances[1:] / distances[:-1], 16 ** (-1 / 8))
-    assert np.allclose(aheads(frames), aheads(frames)[0])
+    path = sources.dolly(0.3, (1, 1, 1), 16, 20, Settings(), no_scene)
+    distances = [np.linalg.norm(camera.position - 1) for camera in path]
+    assert np.allclose(distances, 16 ** np.linspace(1, 0, 9))
+    assert np.allclose([camera.forward for camera in path], path[0].forward)
 
 
 def test_looking_along_up_still_makes_a_camera() -> None:
@@ -371,10 +379,6 @@ def scenes(draw: st.DrawFn) -> Balls:
     return Balls(center, size * draw(st.sampled_from([0.0, 0.01, 1.0])) * random.random(count))
 
 
-def orbited(count: int, center: object, distance: float, elevation: float, up: object) -> list[Frame]:
-    return sources.orbit_frames(np.arange(count), count, center, distance, elevation, up)  # type: ignore[arg-type]
-
-
 def places(camera: Camera, scene: Balls) -> np.ndarray:
     """(N, 4) how far each ball reaches to the right, left, top and bottom: 1 is the edge of the picture."""
     local = (scene.center - camera.position) @ camera.camera_to_world[:3, :3]
@@ -391,17 +395,12 @@ def places(camera: Camera, scene: Balls) -> np.ndarray:
     return np.stack(reach, axis=1)
 
 
-def cameras_at(frames: list[Frame], **settings: Any) -> list[Camera]:
-    return [camera_of(frame.matrix, frame.lens, 0, "", Settings(**settings)) for frame in frames]
-
-
-@given(scene=scenes(), size=SIZES, azimuth=st.integers(0, 359), tilt=st.floats(-80, 80), fov=st.floats(20, 100))
+@given(scene=scenes(), size=SIZES, azimuth=st.integers(0, 35), tilt=st.floats(-80, 80), fov=st.floats(20, 100))
 def test_a_fitted_camera_sees_the_whole_scene_and_fills_its_picture(
     scene: Balls, size: tuple[int, int], azimuth: int, tilt: float, fov: float
 ) -> None:
     scene = covered(scene)
-    start = orbited(360, (0, 0, 0), 1, math.radians(tilt), DEFAULT_UP)[azimuth]
-    (camera,) = cameras_at([start], size=size, fov_y=math.radians(fov))
+    camera = orbited(36, (0, 0, 0), 1, tilt, size=size, fov_y=math.radians(fov))[azimuth]
     reach = places(fitted(camera, scene), scene)
     assert reach.max() <= FILLED * (1 + 1e-4)
     # Along one of the sides it is as large as it can be: it touches both margins.
@@ -415,12 +414,9 @@ def test_every_camera_of_an_orbit_sees_the_whole_scene_and_one_just_so(
 ) -> None:
     scene = covered(scene)
     middle = middle_of(scene)
-
-    def around(away: float, at: np.ndarray) -> list[Camera]:
-        return cameras_at(orbited(count, at, away, math.radians(tilt), DEFAULT_UP), size=size)
-
-    away = distance(around(1, np.zeros(3)), middle, scene)
-    assert max(places(camera, scene).max() for camera in around(away, middle)) == pytest.approx(FILLED, rel=1e-4)
+    away = distance(orbited(count, (0, 0, 0), 1, tilt, size=size).cameras, middle, scene)
+    path = orbited(count, middle, away, tilt, size=size)
+    assert max(places(camera, scene).max() for camera in path) == pytest.approx(FILLED, rel=1e-4)
 
 
 def test_the_largest_thousandth_of_the_balls_is_left_out() -> None:
@@ -500,7 +496,7 @@ def test_balls_have_the_places_of_finite_splats() -> None:
 @pytest.mark.parametrize("size", [1e-6, 1e-4, 1.0, 1e5, 1e30])
 def test_the_clip_planes_reach_around_a_scene_of_any_size(size: float) -> None:
     scene = covered(Balls(np.random.default_rng(0).normal(size=(500, 3)) * size, np.zeros(500)))
-    cameras = [fitted(camera, scene) for camera in cameras_at(orbited(5, (0, 0, 0), 1, 0, DEFAULT_UP))]
+    cameras = [fitted(camera, scene) for camera in orbited(5, (0, 0, 0), 1, 0)]
     default = RasterSettings()
     near, far = reach(default.near, default.far, cameras, scene)
     for camera in cameras:
