@@ -15,9 +15,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.cameras.camera import DEFAULT_UP, Camera, Settings
-from sparklod_cli.cameras.framing import framing
-from sparklod_cli.cameras.sources import cameras_of, orbit_frames
+from sparklod_cli.cameras.camera import Camera, Settings
+from sparklod_cli.cameras.framing import balls_of, framing
+from sparklod_cli.cameras.sources import orbit
 from sparklod_cli.codecs import spark_nodes
 from sparklod_cli.codecs.reader import check_valid, is_valid_and_visible
 from sparklod_cli.images.metrics import on_background, psnr
@@ -381,8 +381,8 @@ def test_cuts_of_a_real_scene_are_closer_to_full_detail_than_those_of_the_quick_
     splats, _ = Selection().apply(read_scene(real_scene("playbot-125k.ply")).splats)
     splats = dataclasses.replace(splats, sh=splats.sh[:, :0])
     middle, radius = framing(splats.center)
-    frames = orbit_frames(np.arange(3), 3, middle, 1.6 * radius, math.radians(15), DEFAULT_UP)
-    cameras = cameras_of(frames, Settings(size=(240, 135), fov_y=math.radians(60)), "an orbit").cameras
+    settings, balls = Settings(size=(240, 135), fov_y=math.radians(60)), balls_of(splats, slice(None), np.eye(4))
+    cameras = orbit(3, tuple(middle), 1.6 * radius, 15, settings, lambda: balls).cameras
 
     def fidelity(tree: tuple[Splats, LodTree]) -> float:
         found = []

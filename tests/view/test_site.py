@@ -657,7 +657,7 @@ def test_a_folder_that_cannot_be_put_in_place_is_put_back(
     found, rename, calls = everything(tmp_path), Path.rename, iter(range(100))
 
     def rename_some(self: Path, target: Path) -> Path:
-        if next(calls) == 1:
+        if target == folder.resolve() and next(calls) == 0:
             raise OSError("cannot rename")
         return rename(self, target)
 
