@@ -632,7 +632,7 @@ def test_a_failure_leaves_everything_as_it_was(
     folder = tmp_path / "site"
     if before:
         export(static, folder, overwrite=False)
-        (folder / "old").write_text("of the site before")
+        (folder / "old.js").write_text("of the site before")
     found = everything(tmp_path)
     write, calls = exporting.write_file, iter(range(100))
 
@@ -653,7 +653,7 @@ def test_a_folder_that_cannot_be_put_in_place_is_put_back(
 ) -> None:
     folder = tmp_path / "site"
     export(static, folder, overwrite=False)
-    (folder / "old").write_text("of the site before")
+    (folder / "old.js").write_text("of the site before")
     found, rename, calls = everything(tmp_path), Path.rename, iter(range(100))
 
     def rename_some(self: Path, target: Path) -> Path:
