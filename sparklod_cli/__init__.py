@@ -6,6 +6,8 @@
     sparklod.write("scene-lod.spz", tree)
 
 What `__all__` names is the public interface, described in docs/python.md. Nothing else is promised to stay as it is.
+Functions that do long work take `threads`, None for all processors, and `progress`: a callback, or a class such as
+`tqdm.tqdm`.
 """
 
 from __future__ import annotations

@@ -290,7 +290,6 @@ def compare(
         render: how pictures are drawn; as Spark 2 does unless given.
         precision: see `cut`.
         threads: to work on; None for all processors. The table does not depend on it.
-        progress: called with how much is done.
 
     Raises:
         FormatError: a scene to be cut has no tree.

@@ -45,8 +45,6 @@ def inspect(
         values: look at the numbers of the splats.
         all_quantities: every quantity of them.
         check: look for faults. An unreadable file is a finding, not an error.
-        threads: to decode on; None for all processors.
-        progress: called with how much is done.
     """
     wanted = ReportSettings(values=values or all_quantities, all_quantities=all_quantities, check=check)
     with progress_callback(progress) as callback, memory_errors_translated():

@@ -67,8 +67,6 @@ def read(
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG, of which level 0 is read.
         columns: of `Splats`, where not all are needed; the others may be 0.
-        threads: to decode on; None for all processors.
-        progress: called with how much is done.
 
     Raises:
         FormatError: it cannot be read, is of no known format, or broken.
@@ -103,7 +101,6 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
     Args:
         scene: a scene or a tree.
         encoding: "packed", "ext", "lodtree" (of a tree) or "texture".
-        threads: to encode on; None for all processors.
 
     Returns:
         arrays of uint32 words by their names, N rows each but for a texture.
@@ -128,7 +125,6 @@ def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = No
 
     Args:
         arrays: those of "packed" or of "ext", and of "lodtree" where there is a tree.
-        threads: to decode on; None for all processors.
 
     Raises:
         FormatError: an array is missing, or has another shape or type.
@@ -241,7 +237,6 @@ def write(
         detail: of a Streamed SOG, which regions and detail levels are made of the tree.
         environment: of a Streamed SOG, a scene without a tree whose splats are always drawn, such as a sky.
         threads: to encode on; None for all processors. The bytes do not depend on it.
-        progress: called with how much is done.
 
     Raises:
         FormatError: the format cannot hold the scene, or there is no such format.

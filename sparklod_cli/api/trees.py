@@ -67,8 +67,6 @@ def build_lod(
         selection: which splats to keep; all that can be drawn, unless given.
         refine: fit merged splats to pictures of full detail: True, or in how many steps, or how. The function `refine`
             does the same and reports the gain.
-        threads: to work on; None for all processors.
-        progress: called with how much is done.
 
     Raises:
         FormatError: the scene has a tree already.
@@ -116,8 +114,6 @@ def simplify(
         cameras: of these pictures; None for cameras around and inside the scene.
         max_sh: SH degrees above this are left out.
         selection: which splats to keep; all that can be drawn, unless given.
-        threads: to work on; None for all processors.
-        progress: called with how much is done.
 
     Raises:
         InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
@@ -174,8 +170,6 @@ def refine(
         cameras: those for which it is fitted; None for cameras around and inside the scene.
         device: "cpu", "cuda" for an NVIDIA card, or "auto" for one if there is one. On a card the result is another
             one, but the same every time.
-        threads: to work on; None for all processors.
-        progress: called with how much is done.
         say: called with a line of text after each stage.
 
     Returns:
@@ -225,7 +219,6 @@ def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: Progres
     Args:
         tree: its nodes in any order that a tree may have: children are consecutive and after their parent.
         threads: to work on; None for all processors. The order does not depend on it.
-        progress: called with how much is done.
 
     Raises:
         FormatError: the scene has no tree.

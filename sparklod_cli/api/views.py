@@ -86,7 +86,6 @@ def cut(
         precision: of the centres and sizes of a tree: "float32", or their half floats, "float16"; or what Spark has of
             it, for the same cut to the last node: "ext" with `extSplats`, else "packed", or "packed-pages" where Spark
             streams a RAD file. Of a tree that was not read from a file, Spark's are taken to be its own numbers.
-        threads: to prepare the trees on; None for all processors.
 
     Raises:
         ValueError: the budget is out of its range, or less than one splat for each instance; `continuous` is not
@@ -157,7 +156,6 @@ def traverse(
         by_instance: rows of single instances, too.
         precision: see `cut`.
         threads: to find cuts on; None for all processors. Only `traverse_ms` depends on it.
-        progress: called with how much is done.
 
     Raises:
         FormatError: a scene has no tree.

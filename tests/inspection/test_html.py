@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.images.scene_plots import DescribedPicture
-from sparklod_cli.inspection.html import FileSection, children_groups, page
+from sparklod_cli.inspection.html import FileSection, page
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.inspection.values import histogram_of, names_of
 from sparklod_cli.tables.histograms import histogram
@@ -230,13 +230,3 @@ def test_a_page_of_a_real_file_says_what_its_report_says(name: str) -> None:
     assert ("Nodes by depth" in text) == (report.tree is not None)
     assert ("Detail levels" in text) == (report.streamed_sog is not None)
     assert ("anisotropy" in text) == (scene is not None)
-
-
-def test_counts_of_children_are_grouped_by_powers_of_two() -> None:
-    assert children_groups({}) == []
-    assert children_groups({"1": 4}) == [("1", 4)]
-    groups = children_groups({"2": 5, "9": 1, "16": 1, "17": 3, "65535": 2})
-    assert groups[1] == ("2", 5)
-    assert groups[8:10] == [("9 to 16", 2), ("17 to 32", 3)]
-    assert groups[-1] == ("32,769 to 65,536", 2)
-    assert sum(count for _, count in groups) == 12

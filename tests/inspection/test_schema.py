@@ -257,10 +257,6 @@ def rows(heading: str) -> list[list[str]]:
     return [[cell.strip().strip("`") for cell in line.strip("|").split(" | ")] for line in lines]
 
 
-def test_the_pages_have_every_code_once() -> None:
-    assert sorted(tuple(row) for row in rows("Findings")) == sorted((code, *told) for code, told in CODES.items())
-
-
 def test_the_pages_have_every_field_once(full: Report) -> None:
     named = [row[0] for row in rows("Fields")]
     assert len(set(named)) == len(named)

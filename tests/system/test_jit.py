@@ -36,11 +36,6 @@ def add(a: float, b: float) -> float:
     return a + b
 
 
-def test_a_kernel_works_where_no_cache_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jit, "CACHE_FOLDER", None)
-    assert jit.kernel()(add)(1.0, 2.0) == 3
-
-
 def imported(path: Path) -> set[Path]:
     """The modules of the package that a module imports when it runs."""
     found = set()

@@ -266,13 +266,6 @@ def test_a_folder_that_takes_no_file_is_told_of_and_does_no_harm(cache: Cache, m
     assert "not a directory" in cache.told[0]
 
 
-def test_a_folder_that_was_removed_is_made_again(cache: Cache) -> None:
-    assert not cache.folder.exists()
-    cache.compiles()
-    assert len(cache.files()) == 1
-    assert cache.told == []
-
-
 def test_a_full_disk_leaves_no_part_of_a_file(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
