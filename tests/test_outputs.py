@@ -71,18 +71,6 @@ def test_folders_are_made_when_there_is_something_to_write(tmp_path: Path) -> No
     assert (target.read_bytes(), (tmp_path / "c" / "out.spz").read_bytes()) == (b"x", b"y")
 
 
-def test_a_folder_that_vanishes_while_a_file_is_written_is_made_again(tmp_path: Path) -> None:
-    target = tmp_path / "a" / "out.spz"
-
-    def pieces() -> Iterator[bytes]:
-        yield b"x"
-        if has_unnamed_files(tmp_path):
-            target.parent.rmdir()  # as another run does that made it, and failed
-
-    write_file(target, pieces(), overwrite=False)
-    assert target.read_bytes() == b"x"
-
-
 @pytest.mark.parametrize("error", [RuntimeError("broken"), MemoryError(), KeyboardInterrupt(), SystemExit(3)])
 @pytest.mark.parametrize("existing", [False, True])
 def test_an_interrupted_file_leaves_the_former_one(error: BaseException, existing: bool, tmp_path: Path) -> None:
@@ -136,17 +124,6 @@ def test_concurrent_writers_of_one_name_do_not_share_a_temporary_file(tmp_path: 
     with pytest.raises(OutputError, match="exists, add --overwrite"):
         write_file(tmp_path / "new.spz", taken(), overwrite=False)
     assert held(tmp_path) == {"out.spz": b"outer", "new.spz": b"another's"}
-
-
-@posix
-@pytest.mark.parametrize("mask", [0o022, 0o077, 0o002])
-def test_permissions_follow_the_umask(mask: int, tmp_path: Path) -> None:
-    before = os.umask(mask)
-    try:
-        write_file(tmp_path / "out.spz", [b"x"], overwrite=False)
-    finally:
-        os.umask(before)
-    assert stat.S_IMODE((tmp_path / "out.spz").stat().st_mode) == 0o666 & ~mask
 
 
 @posix
@@ -397,17 +374,6 @@ def test_an_existing_file_is_refused_before_any_work(header: str, taken: str, tm
     assert held(tmp_path) == {taken: b"precious"}
 
 
-@pytest.mark.parametrize(("header", "taken"), [("x.rad", "x-1.radc"), ("lod-meta.json", "0_1/meta.json")])
-def test_a_file_that_appears_while_others_are_written_is_named(header: str, taken: str, tmp_path: Path) -> None:
-    def files() -> Iterator[tuple[str, Iterable[bytes]]]:
-        yield from pieces_of(rad() if header == "x.rad" else streamed("0_0", "0_1"))
-        put_files(tmp_path, {taken: b"another's"})
-
-    with pytest.raises(OutputError, match=rf"{Path(taken).name} exists, add --overwrite"):
-        write_files(output(tmp_path / header), files())
-    assert held(tmp_path) == {taken: b"another's"}
-
-
 @pytest.mark.parametrize("suffix", ["rad", "json"])
 def test_places_that_cannot_hold_several_files_are_refused(suffix: str, tmp_path: Path) -> None:
     open_output: Callable[..., Output] = output if suffix == "rad" else parts_output
@@ -437,28 +403,6 @@ def test_all_files_are_written_to_the_folder_that_a_linked_header_is_in(
     write(link, files)
     assert held(tmp_path / "store") == files
     assert link.is_symlink()
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
-@pytest.mark.parametrize("existing", [False, True])
-@EVERY_SET
-def test_an_error_while_files_are_written_leaves_the_former_output(
-    header: str, files: Files, existing: bool, error: BaseException, tmp_path: Path
-) -> None:
-    target = tmp_path / "a" / "b" / header
-    (tmp_path / "a").mkdir()
-    if existing:
-        write(target, files)
-    before = held(tmp_path)
-
-    def broken() -> Iterator[tuple[str, Iterable[bytes]]]:
-        yield from list(pieces_of(files))[:-1]
-        raise error
-
-    with pytest.raises(KeyboardInterrupt if isinstance(error, KeyboardInterrupt) else OutputError):
-        write_files(output(target, overwrite=existing), broken())
-    assert held(tmp_path) == before
-    assert existing or names(tmp_path / "a") == []  # its new folders are removed, too
 
 
 def test_an_output_without_writes_is_no_file(tmp_path: Path) -> None:

@@ -573,65 +573,41 @@ def with_scales(splats: Splats, scales: Any, generator: str = "another 1") -> by
     )
 
 
-@pytest.mark.parametrize("factor", [1, 20])
-def test_logarithms_are_read_as_such(factor: float) -> None:
-    splats = random_splats(2_000)
-    logs = np.log(splats.scale.astype(np.float64) * factor)
-    assert (logs < 0).any(axis=1).mean() > 0.3
-    back = read(with_scales(splats, logs))
-    assert back.notes == (READ_AS_LOGS,)
-    np.testing.assert_allclose(back.splats.scale, splats.scale * factor, rtol=1e-5)
+SCALES = random_splats(2_000).scale.astype(np.float64)
+MIRRORED = SCALES * [-1, 1, 1]
 
 
 @pytest.mark.parametrize(
-    ("generator", "are_logs"),
+    ("scales", "generator", "are_logs"),
     [
-        ("gsbox v4.8.4", True),
-        ("gsbox v5.0.0", False),
-        ("splat-transform 1.10.2", True),
-        ("splat-transform 2.6.0", True),
-        ("splat-transform 2.7.0", False),
-        ("splat-transform v3.2.0", False),
+        (np.log(SCALES), "another 1", True),
+        (np.log(20 * SCALES), "another 1", True),
+        (np.tile([0.0, 0.5, -0.5], (30, 1)), "another 1", True),  # as in test data of the extension's draft
+        (MIRRORED, "another 1", False),
+        (np.where(np.arange(2_000)[:, None] % 50 == 0, MIRRORED, SCALES), "another 1", False),
+        (np.abs(np.log(SCALES)), "gsbox v4.8.4", True),  # no logarithm is below 0: the generator decides
+        (np.abs(np.log(SCALES)), "gsbox v5.0.0", False),
+        (np.abs(np.log(SCALES)), "splat-transform 1.10.2", True),
+        (np.abs(np.log(SCALES)), "splat-transform 2.6.0", True),
+        (np.abs(np.log(SCALES)), "splat-transform 2.7.0", False),
+        (np.abs(np.log(SCALES)), "splat-transform v3.2.0", False),
     ],
 )
-def test_the_generator_decides_if_no_logarithm_is_below_0(generator: str, are_logs: bool) -> None:
-    splats = random_splats(2_000)
-    scales = np.exp(np.abs(np.log(splats.scale.astype(np.float64))))
-    back = read(with_scales(splats, np.log(scales), generator))
+def test_scales_that_are_logarithms_are_recognised(scales: Any, generator: str, are_logs: bool) -> None:
+    back = read(with_scales(random_splats(len(scales)), scales, generator))
     assert (back.notes == (READ_AS_LOGS,)) == are_logs
-    np.testing.assert_allclose(back.splats.scale, scales if are_logs else np.log(scales), rtol=1e-5)
+    np.testing.assert_allclose(back.splats.scale, np.exp(scales) if are_logs else scales, rtol=1e-5)
 
 
-@pytest.mark.parametrize("extent", [1.0, 200.0])
-def test_possible_logarithms_are_noted(extent: float) -> None:
-    rng = np.random.default_rng(3)
+@pytest.mark.parametrize("extent", [1.0, 200.0, 4_000.0])
+def test_scales_that_may_be_logarithms_are_noted_and_others_are_not(extent: float) -> None:
     splats = random_splats(3_000, extent=extent)
-    scales = np.exp(rng.normal(1.4, 0.3, (3_000, 3)))
-    (note,) = read(with_scales(splats, np.log(scales))).notes
-    assert "look like logarithms" in note and "are read as linear ones" in note
-
-
-@pytest.mark.parametrize("scale", [0.01, 1.0, 40.0])
-def test_linear_scales_of_any_size_are_not_doubted(scale: float) -> None:
-    splats = random_splats(3_000, extent=scale * 100)
-    assert read(with_scales(splats, splats.scale)).notes == ()
-    even = np.full_like(splats.scale, scale)
-    assert read(with_scales(splats, even)).notes == ()
-
-
-def test_one_logarithm_below_0_in_each_splat_is_enough() -> None:
-    scales = np.tile([0.0, 0.5, -0.5], (30, 1))  # as a file of test data for the extension's draft has them
-    back = read(with_scales(SH0, scales))
-    np.testing.assert_allclose(back.splats.scale, np.exp(scales), rtol=1e-6)
-
-
-@pytest.mark.parametrize("broken", [slice(0, None, 50), slice(None)], ids=["some", "mirrored"])
-def test_linear_scales_below_0_are_no_logarithms(broken: slice) -> None:
-    splats = random_splats(2_000)
-    scales = splats.scale.copy()
-    scales[broken, 0] *= -1
-    back = read(with_scales(splats, scales))
-    assert back.notes == () and (back.splats.scale[broken, 0] < 0).all()
+    logs = np.random.default_rng(3).normal(1.4, 0.3, (3_000, 3))
+    if extent < 1_000:
+        (note,) = read(with_scales(splats, logs)).notes
+        assert "look like logarithms" in note and "are read as linear ones" in note
+    for linear_scales in (splats.scale, np.full_like(splats.scale, extent / 100)):
+        assert read(with_scales(splats, linear_scales)).notes == ()
 
 
 @pytest.mark.parametrize("value", [-3e38, -np.inf, np.nan, 3e38, np.inf])

@@ -315,14 +315,11 @@ LEVELS, SPLATS = "expected a whole number from 1 to 32", "expected a whole numbe
     [
         ({"lodLevels": ...}, f"lodLevels of lod-meta.json: {LEVELS}, but it is missing"),
         ({"lodLevels": 0}, f"lodLevels of lod-meta.json: {LEVELS}, not 0"),
-        ({"lodLevels": 1e9}, f"lodLevels of lod-meta.json: {LEVELS}, not 1000000000.0"),
         ({"lodLevels": True}, f"lodLevels of lod-meta.json: {LEVELS}, not True"),
         ({"filenames": "x"}, "filenames of lod-meta.json: expected a list, not 'x'"),
         ({"filenames": [1]}, "filenames[0] of lod-meta.json: expected a text, not 1"),
         ({"environment": 7}, "environment of lod-meta.json: expected a text, not 7"),
         ({"tree": ...}, "tree of lod-meta.json: expected an object, but it is missing"),
-        ({"tree": []}, "tree of lod-meta.json: expected an object, not []"),
-        ({"tree": {"children": 5}}, "tree.children of lod-meta.json: expected a list, not 5"),
         ({"tree": {"children": 0}}, "tree.children of lod-meta.json: expected a list, not 0"),
         ({"tree": {"children": [LEAF, 5]}}, "tree.children[1] of lod-meta.json: expected an object, not 5"),
         (
@@ -330,7 +327,6 @@ LEVELS, SPLATS = "expected a whole number from 1 to 32", "expected a whole numbe
             "tree.children[1].children[1].lods of lod-meta.json: expected an object, not 1",
         ),
         ({"tree": {"lods": {"2": {}}}}, "tree.lods.2 of lod-meta.json: there is no such level, only 0 to 1"),
-        ({"tree": {"lods": {"01": {}}}}, "tree.lods.01 of lod-meta.json: there is no such level, only 0 to 1"),
         ({"tree": {"lods": {"1": 3}}}, "tree.lods.1 of lod-meta.json: expected an object, not 3"),
         ({"tree": leaf(file=2)}, "tree.lods.1.file of lod-meta.json: expected a whole number from 0 to 1, not 2"),
         ({"tree": leaf(file=None)}, "tree.lods.1.file of lod-meta.json: expected a whole number from 0 to 1, but it"),

@@ -29,15 +29,17 @@ from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
 from sparklod_cli.codecs.rad.rad_reader import read_chunk
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
+from sparklod_cli.inspection.tree import examine
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.gaussian import lod_opacity
 from sparklod_cli.model.lod_tree import CHUNK_NODES, MAX_CHILDREN
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, FloatArray, Splats
-from tests.codecs.cases import encode, linear
+from tests.codecs.cases import encode, linear, rotation_degrees
 from tests.codecs.writers import as_ply
-from tests.conftest import FIXTURES, real_scene
+from tests.conftest import FIXTURES, Capture, real_scene
+from tests.inspection.test_tree_facts import check_facts
 from tests.interop.node import PROGRAMS
 from tests.interop.spark import Spark
 from tests.interop.spark_words import (
@@ -385,6 +387,70 @@ def test_a_noted_up_axis_changes_no_word(spark: Spark, suffix: str, lod: bool, t
     assert words[0].keys() == words[1].keys()
     for name, values in words[0].items():
         np.testing.assert_array_equal(words[1][name], values, name)
+
+
+# --- Trees of Spark's builders ----------------------------------------------------------------------------------------
+
+#: Values of Spark's option `lod` for its two builders, the tiny one and Bhattacharyya's, by sparklod's methods.
+BUILDERS: dict[str, Any] = {"quick": True, "quality": "quality"}
+
+
+def spark_tree(spark: Spark, source: Path, builder: str) -> Scene:
+    """Return the tree that Spark builds from a file, as it has it in memory."""
+    words = spark.load_words("Ext", source, lod=BUILDERS[builder])
+    nodes = spark_nodes.unpack({"lod_tree": words.pop("lodTree")})
+    return Scene(ext_splats.unpack(words), nodes.tree)
+
+
+def inspected(path: Path, capsys: Capture, *options: str) -> tuple[int, dict[str, Any]]:
+    """Run `inspect --check`, and return its exit status and its report."""
+    code = run(["inspect", str(path), "--json", "--check", *options])
+    return code, json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(
+    ("name", "builder"),
+    [("sh2.ply", "quality"), ("demo.ply", "quality"), ("demo.ply", "quick"), ("biker.ply", "quick")],
+)
+def test_trees_of_spark_have_no_faults(spark: Spark, tmp_path: Path, capsys: Capture, name: str, builder: str) -> None:
+    """A fixture with SH, one without, and a real scene with more nodes than a chunk."""
+    source = FIXTURES / name if (FIXTURES / name).exists() else real_scene(name)
+    path = put(tmp_path / "tree.spz", encode(spz, spark_tree(spark, source, builder), threads=2))
+    code, report = inspected(path, capsys, "--fail-on", "warning")
+    scene = read_scene(path)
+    assert scene.tree is not None and code == 0
+    check_facts(scene.splats, scene.tree, examine(scene.splats, scene.tree)[0])
+    assert report["tree"]["leaves"] == len(read_scene(source).splats)
+    # The first 65,536 nodes are coarse before fine. The others follow part by part of the scene, which is a note.
+    assert [finding["code"] for finding in report["findings"]] == ["tree.coarse-first"] * (len(scene) > CHUNK_NODES)
+    assert all(finding["index"] > CHUNK_NODES for finding in report["findings"])
+
+
+@pytest.mark.parametrize("builder", BUILDERS)
+def test_leaves_of_sparks_trees_are_the_splats_except_for_small_rotations(
+    spark: Spark, tmp_path: Path, capsys: Capture, builder: str
+) -> None:
+    """Spark's builders hold the w of a rotation as float16, which rounds it to 1 below 2.5 degrees."""
+    source = FIXTURES / "demo.ply"
+    scene = spark_tree(spark, source, builder)
+    path = put(tmp_path / "tree.spz", encode(spz, scene))
+    code, report = inspected(path, capsys, "--leaves-of", str(source))
+    original = read_scene(source).splats
+    by_center = {tuple(center): quat for center, quat in zip(original.center.tolist(), original.quat_xyzw, strict=True)}
+    assert scene.tree is not None
+    leaves = scene.splats.take(scene.tree.is_leaf)
+    quats = np.array([by_center[tuple(center)] for center in leaves.center.tolist()], np.float64)
+    turned = rotation_degrees(leaves.quat_xyzw, quats)
+    assert code == 3
+    (finding,) = (each for each in report["findings"] if each["code"] == "expect.leaves")
+    assert 0 < np.count_nonzero(turned > 1) <= np.count_nonzero(turned > 0.5) < 1e-3 * len(leaves)
+    # They hold scales as float16, too, so that a few are rounded to other codes, and opacities compensate for that.
+    assert np.count_nonzero(turned > 1) <= finding["count"] < 1e-2 * len(leaves)
+    assert turned.max() < 2.6
+    # Without such small rotations, the leaves are the splats.
+    needle = put(tmp_path / "needle.spz", encode(spz, spark_tree(spark, FIXTURES / "needle.ply", builder)))
+    code, report = inspected(needle, capsys, "--leaves-of", str(FIXTURES / "needle.ply"))
+    assert (code, report["tree"]["leaves"]) == (0, 60)
 
 
 # --- JavaScript -------------------------------------------------------------------------------------------------------
