@@ -93,7 +93,10 @@ def open_content(source: OpenFile) -> Reader:
     """
     file = GltfFile(source)
     primitives = _primitives(file)
-    _check_required(file)
+    required = file.root.get("extensionsRequired", [])
+    for name in required if isinstance(required, list) else [required]:
+        if name not in READ and not str(name).startswith(INDIFFERENT):
+            raise UnsupportedError(f"it requires the extension {quoted_value(name)}, which is not read")
     parts, notes = _parts(file, primitives)
     asset = file.root.get("asset")
     asset = asset if isinstance(asset, dict) else {}
@@ -143,13 +146,6 @@ def _extensions(record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the extensions of an object of the JSON whose values are objects, too."""
     found = record.get("extensions")
     return {name: each for name, each in found.items() if isinstance(each, dict)} if isinstance(found, dict) else {}
-
-
-def _check_required(file: GltfFile) -> None:
-    required = file.root.get("extensionsRequired", [])
-    for name in required if isinstance(required, list) else [required]:
-        if name not in READ and not str(name).startswith(INDIFFERENT):
-            raise UnsupportedError(f"it requires the extension {quoted_value(name)}, which is not read")
 
 
 def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[list[PlacedPrimitive], list[str]]:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ..model import morton
 from ..model.scene import Bounds, Counts, DetailScene, Scene, facts_of
 from ..model.sh import width_of
-from ..model.splats import Splats
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
@@ -207,8 +206,13 @@ def encode_files(
 
     def encoded(plan: ChunkPlan | None) -> tuple[int, list[tuple[str, bytes]]]:
         """Return the number of splats and the files of a chunk; of the environment for None."""
-        part = scene.environment if plan is None else _ordered(scene, plan)
-        assert part is not None
+        if plan is None:
+            assert scene.environment is not None
+            part = scene.environment
+        else:
+            runs = (scene.run(region, plan.level) for region in plan.regions)
+            index = [run.start + morton.order(scene.splats.center[run]) for run in runs if run.start < run.stop]
+            part = scene.splats.take(np.concatenate(index))
         one = Scene(part, antialiased=scene.antialiased, up=scene.up)
         inside = max(1, threads // together)
         if plan is None:
@@ -239,12 +243,6 @@ def planned(scene: DetailScene, chunk_splats: int) -> list[ChunkPlan]:
                 plans.append(ChunkPlan(chunk_folder(level, number), level, range(first, region + 1)))
                 number, first, size = number + 1, region + 1, 0
     return plans
-
-
-def _ordered(scene: DetailScene, plan: ChunkPlan) -> Splats:
-    runs = (scene.run(region, plan.level) for region in plan.regions)
-    index = [run.start + morton.order(scene.splats.center[run]) for run in runs if run.start < run.stop]
-    return scene.splats.take(np.concatenate(index))
 
 
 def manifest_of(scene: DetailScene, plans: list[ChunkPlan], settings: Divided) -> Manifest:

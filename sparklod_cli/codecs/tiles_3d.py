@@ -225,7 +225,9 @@ def encode_files(
     if not (np.abs(scene.bounds) <= LARGEST).all() or not (scene.errors <= LARGEST).all():
         raise FormatError("its splats reach beyond what float32 holds, in which viewers draw; scale it down")
     options = replace(options, glb_profile=options.glb_profile or CESIUM)
-    names, together, done = tile_names(scene), max(1, min(threads, scene.tiles)), 0
+    numbers = defaultdict[int, Iterator[int]](itertools.count)
+    names = [f"{level}-{next(numbers[level])}" for level in scene.level.tolist()]
+    together, done = max(1, min(threads, scene.tiles)), 0
 
     def encoded(tile: int) -> bytes:
         one = Scene(scene.splats.take(scene.run(tile)), antialiased=scene.antialiased, up=scene.up)
@@ -236,12 +238,6 @@ def encode_files(
         done += int(scene.counts[tile])
         progress("writing", done, len(scene.splats), "splat")
     yield from _tilesets(scene, options, names, most_tiles)
-
-
-def tile_names(scene: TileScene) -> list[str]:
-    """Return the name of each tile, its level and its number in that, without a suffix."""
-    numbers = defaultdict[int, Iterator[int]](itertools.count)
-    return [f"{level}-{next(numbers[level])}" for level in scene.level.tolist()]
 
 
 def _tilesets(

@@ -19,7 +19,7 @@ from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod.tree_settings import TileSettings
 from sparklod_cli.model.scene import Scene
 from tests.conftest import FIXTURES, ROOT
-from tests.interop.engines import GLB, Browser, Shown, detailed, sky, written
+from tests.interop.engines import GLB, Browser, Shown, detailed, written
 from tests.part_files import tiled
 
 FOLDER = ROOT / "docs" / "images" / "engines"
@@ -45,7 +45,7 @@ def main() -> None:
     assert chromium, "Chromium is not installed"
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
-        shot = written(detailed(sky()), Path(name), SIZE)
+        shot = written(detailed(with_sky=True), Path(name), SIZE)
         browser = Browser(Path(os.environ["ENGINES_DIR"]), chromium, Path(name))
         for engine, settings in (("playcanvas", {}), ("babylon", None)):
             _save(engine, getattr(browser, engine)(shot.file, shot.camera, settings))

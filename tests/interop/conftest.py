@@ -9,7 +9,7 @@ import pytest
 
 import sparklod_cli
 from tests.interop import engines
-from tests.interop.engines import Browser, Shot, detailed, sky
+from tests.interop.engines import Browser, Shot, detailed
 from tests.interop.foreign import Foreign, SplatTransform, SpzLibrary
 from tests.interop.node import ENGINES, FOREIGN, PAGE, SPARK, SPZ_LIBRARY, folder_with, require
 from tests.interop.pictures import Page
@@ -98,7 +98,7 @@ def shot(tmp_path_factory: pytest.TempPathFactory) -> Shot:
 @pytest.fixture(scope="session")
 def shot_with_sky(tmp_path_factory: pytest.TempPathFactory) -> Shot:
     """The same scene with an environment, which is in its splats."""
-    return engines.written(detailed(sky()), tmp_path_factory.mktemp("web"))
+    return engines.written(detailed(with_sky=True), tmp_path_factory.mktemp("web"))
 
 
 @pytest.fixture(scope="session")

@@ -289,10 +289,10 @@ DETAIL = DetailSettings((0.25, 0.05), chunk_splats=8_000, extent=4, min_splats=2
 
 
 @functools.cache
-def detailed(environment: Splats | None = None) -> DetailScene:
-    """Return the demo scene at several detail levels, with the axis that points up noted."""
+def detailed(*, with_sky: bool = False) -> DetailScene:
+    """Return the demo scene at several detail levels, with the up axis noted, and its far sky as environment."""
     scene = parts.make_levels(*quality.build(read_scene(FIXTURES / "demo.ply").splats, 2.0), DETAIL)
-    return dataclasses.replace(scene, up="-y", environment=environment)
+    return dataclasses.replace(scene, up="-y", environment=sky() if with_sky else None)
 
 
 def sky() -> Splats:

@@ -75,17 +75,11 @@ class RadHeader:
     """The header of a file.
 
     Attributes:
-        count: splats, which are the nodes where there is a tree.
-        max_sh: SH degree.
-        lod_tree: whether the splats are the nodes of a Level-of-Detail tree.
+        count: splats, which are the nodes if there is a tree.
         chunk_size: splats of each chunk but the last.
-        all_chunk_bytes: sum of the chunks' sizes.
-        chunks: where they are, in order.
-        encoding: ranges of the codes; None where the header has none.
-        sh_code_count: entries of the SH palette; None without one.
-        comment: free text; None without one.
-        bytes: of the header with its padding: where the first chunk begins.
-        padded_with_zeros: whether the padding is zeros.
+        encoding: ranges of the codes.
+        sh_code_count: entries of the SH palette.
+        bytes: of the header with its padding, after which the first chunk begins.
     """
 
     count: int
@@ -127,14 +121,9 @@ class RadChunkHeader:
 
     Attributes:
         base: index of its first splat in the file.
-        count: its splats.
-        payload_bytes: of its properties with their padding, as the JSON has it.
-        max_sh, lod_tree: as in `RadHeader`.
-        properties: in the order of the file.
-        encoding: ranges of the codes; None where the header has none.
-        stored_payload_bytes: the same number again, as it stands before the payload.
-        bytes: of the header with its padding and the size of the payload: where the payload begins.
-        padded_with_zeros: whether the padding is zeros.
+        payload_bytes: of its properties with their padding, in the JSON.
+        stored_payload_bytes: the same number before the payload.
+        bytes: of the header with its padding and the size of the payload, after which the payload begins.
     """
 
     base: int
@@ -351,11 +340,6 @@ FIRST_LOOK, LAST_LOOK = 1 << 16, 1 << 20
 broken = functools.partial(violation, "rad")
 
 
-def expected_chunks(header: RadHeader) -> int:
-    """Return how many chunks the splats of a file take."""
-    return -(-header.count // max(header.chunk_size, 1))
-
-
 def expected_count(header: RadHeader, number: int) -> int:
     """Return how many splats a chunk has."""
     return max(0, min(header.chunk_size, header.count - number * header.chunk_size))
@@ -377,7 +361,7 @@ def header_violations(
     elif header.bytes > FIRST_LOOK:
         text = f"its header has {header.bytes:,} bytes; Spark asks for {FIRST_LOOK:,} at first"
         yield broken("header-large", text, fatal=False)
-    wanted = expected_chunks(header)
+    wanted = -(-header.count // max(header.chunk_size, 1))
     if len(header.chunks) != wanted or (header.count and not header.chunk_size):
         yield broken(
             "chunks",

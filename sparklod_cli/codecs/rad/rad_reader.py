@@ -228,11 +228,10 @@ class RadChunk:
     """One chunk of a file.
 
     Attributes:
-        header: its own.
-        splats: of the chunk; SH are 0 where they are labels and the palette is not known.
-        tree: the columns of its nodes, whose children have the numbers of the file; None where there is no tree.
-        palette: (codes, K, 3) SH coefficients, of the first chunk of a file that has some.
-        labels: (N,) into the palette, where that is not known.
+        splats: with SH of 0 if they are labels and the palette is unknown.
+        tree: its children have the numbers of the file.
+        palette: (codes, K, 3) SH coefficients, of the first chunk of a file with a palette.
+        labels: (N,) into the palette, if that is unknown.
     """
 
     header: RadChunkHeader
@@ -366,7 +365,8 @@ class PackedChunk:
         palette = np.zeros((count, COEFFICIENTS[header.max_sh], 3), np.float32)
         for degree, each in codes.items():
             if degree <= header.max_sh:
-                fill_sh(palette, degree, self.values(each, BY_NAME[each.name], count))
+                part = palette[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]]
+                part[...] = self.values(each, BY_NAME[each.name], count).reshape(part.shape)
         return palette
 
     def values(self, each: Property, row: Row, count: int) -> NDArray[Any]:
@@ -394,11 +394,6 @@ class PackedChunk:
                 f"{subject} has {len(data):,} bytes; {count:,} splats in {each.encoding} take {expected:,}"
             )
         return np.frombuffer(data, np.uint8)
-
-
-def fill_sh(out: FloatArray, degree: int, values: FloatArray) -> None:
-    """Fill the coefficients of one degree of (N, K, 3) from (N, numbers), r g b innermost."""
-    out[:, COEFFICIENTS[degree - 1] : COEFFICIENTS[degree]] = values.reshape(len(out), -1, 3)
 
 
 @np.errstate(invalid="ignore", over="ignore")  # any bits may be a float
@@ -449,7 +444,8 @@ def fill(
 
 def _fill_column(splats: Splats, row: Row, values: NDArray[Any]) -> None:
     if row.column == "sh":
-        fill_sh(splats.sh, row.degree, values)
+        part = splats.sh[:, COEFFICIENTS[row.degree - 1] : COEFFICIENTS[row.degree]]
+        part[...] = values.reshape(part.shape)
     elif row.column == "opacity":
         splats.opacity[:] = spark_codings.decode_lod_alpha(values[:, 0].astype(np.float32))
     elif row.column == "quat_xyzw" and values.shape[1] == 3:

@@ -82,15 +82,10 @@ def needed(options: WriteOptions) -> frozenset[str]:
     """Return the statistics by which `settled` settles these options."""
     rad = options.rad
     ranges = NEEDED if rad.ranges is None else frozenset[str]()
-    rounds = {"leaf_scale"} if _rounds(rad) else set()
+    rounds = {"leaf_scale"} if rad.center == AUTO and rad.center_bits is None else set()
     turns = {"leaf_length"} if rad.orientation == AUTO else set()
     reach = {"reach"} if rad.center in HALF else set()
     return ranges | rounds | turns | reach
-
-
-def _rounds(rad: RadOptions) -> bool:
-    """Return whether the rounding of centres is left open."""
-    return rad.center == AUTO and rad.center_bits is None
 
 
 def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
@@ -114,7 +109,7 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     if rad.orientation == AUTO and statistics.values["leaf_length"].quantile(0.5) >= LONG:
         chosen["orientation"] = "f16"
     bits = rad.center_bits
-    if _rounds(rad):
+    if rad.center == AUTO and bits is None:
         # The lowest bytes of rounded float32 are mostly zeros, which take no room.
         bits = min(fine_bits(statistics.values["leaf_scale"]), EXACT_BITS)
     return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, center_bits=bits, ranges=ranges))
@@ -366,7 +361,10 @@ class RadEncoder:
         flat = _flat(coding.encode(values, each.min or 0.0, each.max or 0.0), encoding, len(splats))
         unchanged = self.unchanged[start:stop]
         _by_splat(flat, row, encoding)[unchanged] = before[unchanged]
-        return encoding, _stored(flat, encoding, len(splats)), each.min, each.max
+        if _differs(encoding):
+            planes = flat.reshape(-1, len(splats))
+            flat = np.diff(planes, axis=1, prepend=np.zeros((len(planes), 1), np.uint8))
+        return encoding, flat, each.min, each.max
 
     def _former(self, name: str, start: int, stop: int) -> tuple[Property, Bytes] | None:
         """Return a property of some nodes and (n, ...) their codes; None where its coding differs between chunks."""
@@ -408,7 +406,11 @@ class RadEncoder:
             return labels[:, None]
         column: NDArray[Any] = getattr(splats if row.column in COLUMNS else tree, row.column)
         if row.column == "opacity":
-            return _alpha(self._opacity(splats), encoding, self.codes)[:, None]
+            alpha = spark_codings.encode_lod_alpha(self._opacity(splats))
+            if encoding == "r8" and self.codes.lod_opacity:
+                # As a code, 1 of 0..2 lies between two of them, and must not become the upper one, of a merged splat.
+                alpha = np.where(alpha == 1, _BELOW_1, alpha)
+            return alpha[:, None]
         if row.column == "quat_xyzw" and encoding != "oct88r8":
             return column[:, :3] * np.where(column[:, 3:] < 0, np.float32(-1), np.float32(1))
         if row.column == "center" and self.options.rad.center_bits is not None:
@@ -470,15 +472,6 @@ def rounded(center: FloatArray, bits: int) -> FloatArray:
     most = float(math.floor(math.ldexp(float(np.finfo(np.float32).max), bits)))
     multiples = np.rint(np.ldexp(center.astype(np.float64), bits)).clip(-most, most)
     return np.ldexp(multiples, -bits).astype(np.float32)
-
-
-def _alpha(opacity: FloatArray, encoding: str, ranges: SplatEncoding) -> FloatArray:
-    """Return the alpha of linear opacities.
-
-    As a code, 1 of 0..2 lies between two of them; it must not become the upper one, which is that of a merged splat.
-    """
-    alpha = spark_codings.encode_lod_alpha(opacity)
-    return np.where(alpha == 1, _BELOW_1, alpha) if encoding == "r8" and ranges.lod_opacity else alpha
 
 
 def encode(
@@ -559,13 +552,6 @@ def _flat(codes: NDArray[Any], encoding: str, count: int) -> Bytes:
     """Return the bytes of a property, a copy; those of differences as the codes themselves."""
     flat = np.array(codes).reshape(-1).view(np.uint8)
     return np.cumsum(flat.reshape(-1, count), axis=1, dtype=np.uint8).reshape(-1) if _differs(encoding) else flat
-
-
-def _stored(flat: Bytes, encoding: str, count: int) -> Bytes:
-    if not _differs(encoding):
-        return flat
-    planes = flat.reshape(-1, count)
-    return np.diff(planes, axis=1, prepend=np.zeros((len(planes), 1), np.uint8))
 
 
 def _differs(encoding: str) -> bool:
