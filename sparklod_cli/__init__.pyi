@@ -38,7 +38,7 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .codecs.rad.rad_header import RadChunkEntry as RadChunkEntry
     from .codecs.rad.rad_header import RadChunkHeader as RadChunkHeader
     from .codecs.rad.rad_header import RadHeader as RadHeader
-    from .codecs.rad.rad_writer import RadChunk as RadChunk
+    from .codecs.rad.rad_reader import RadChunk as RadChunk
     from .codecs.spark_codings import SplatEncoding as SplatEncoding
     from .fitting.fit_settings import FitSettings as FitSettings
     from .fitting.fit_settings import Refined as Refined

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..codecs.rad.rad_header import RadHeader
-    from ..codecs.rad.rad_writer import RadChunk
+    from ..codecs.rad.rad_reader import RadChunk
 
 #: Errors of public functions that begin with the name of the file.
 OF_FILES = (FormatError, InvalidSplatsError, TreeError)

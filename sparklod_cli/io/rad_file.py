@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from ..codecs.rad.rad_header import RadHeader, header_violations, read_header
-from ..codecs.rad.rad_reader import RadReader, decoded_bytes, file_of
-from ..codecs.rad.rad_writer import RadChunk, read_chunk
+from ..codecs.rad.rad_reader import RadChunk, RadReader, decoded_bytes, file_of, read_chunk
 from ..codecs.rules import check_rules
 from ..model.splats import FloatArray
 from ..system.errors import UnreadableError
@@ -48,7 +47,7 @@ def read_rad_chunk(path: Path, number: int, *, palette: FloatArray | None = None
     """Read the header of a RAD file, and one chunk of it.
 
     Args:
-        palette: that of the first chunk, see `codecs.rad.rad_writer.read_chunk`.
+        palette: that of the first chunk, see `rad_reader.read_chunk`.
 
     Raises:
         FormatError: the header or the chunk cannot be read, or is broken.

@@ -132,13 +132,7 @@ ALIKE = {
 
 @dataclass(frozen=True)
 class Request:
-    """A file that a page asked for.
-
-    Attributes:
-        name: its path from the scene's folder.
-        bytes: its size.
-        milliseconds: since the first request.
-    """
+    """A page's request for a file, by its path from the scene's folder, and the time since the first request."""
 
     name: str
     bytes: int
@@ -163,13 +157,7 @@ class Shown:
 
 
 class Browser:
-    """One browser, which shows one page at a time.
-
-    Args:
-        package_dir: the folder with node_modules.
-        chromium: path of the browser.
-        scratch: an empty folder for files.
-    """
+    """One browser, which shows one page at a time."""
 
     def __init__(self, package_dir: Path, chromium: str, scratch: Path) -> None:
         self._out = scratch / "picture"

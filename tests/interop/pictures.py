@@ -44,13 +44,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Request:
-    """Spark's request for a file of a scene.
-
-    Attributes:
-        name: of the file.
-        bytes: that were sent.
-        start: of the range of bytes that it asked for; None for the whole file.
-    """
+    """Spark's request for a file of a scene, or for a range of its bytes that begins at `start`."""
 
     name: str
     bytes: int
@@ -58,13 +52,7 @@ class Request:
 
 
 class Page:
-    """One browser with Spark, which shows one file at a time.
-
-    Args:
-        package_dir: the folder with node_modules.
-        chromium: path of the browser.
-        scratch: an empty folder for files.
-    """
+    """One browser with Spark, which shows one file at a time."""
 
     def __init__(self, package_dir: Path, chromium: str, scratch: Path) -> None:
         self._out = scratch / "picture"
@@ -176,11 +164,7 @@ def compare(
     """Draw a file with each camera in both programs, and yield the differences.
 
     Args:
-        page: the browser with Spark.
-        file: a splat file, or an LoD file if there is a budget.
-        cameras: cameras of one size.
-        settings: the raster settings.
-        budget: number of nodes of the tree at most; 0 for a plain splat file.
+        budget: most nodes of the tree; 0 for a plain splat file.
     """
     scene = read_scene(file)
     count = page.open(file, cameras[0], settings)

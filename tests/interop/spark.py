@@ -37,14 +37,7 @@ class Reply:
 
 @dataclass(frozen=True)
 class ExtSplats:
-    """Decoded ExtSplats of N splats.
-
-    Attributes:
-        alpha: (N,) as stored: the opacity; in an LoD file 1..2 is an LoD opacity D of 1..5.
-        lod_opacity: (N,) LoD opacity D.
-        sh: (N, K, 3), K = 0, 3, 8 or 15.
-        nodes: (N,) `NODE` rows; None if Spark found no tree in the file.
-    """
+    """Decoded ExtSplats of N splats, with `NODE` rows if the file has a tree."""
 
     center: NDArray[np.float32]
     alpha: NDArray[np.float64]
@@ -53,10 +46,6 @@ class ExtSplats:
     quat_xyzw: NDArray[np.float64]
     sh: NDArray[np.float64]
     nodes: NDArray[Any] | None
-
-    @property
-    def lod_opacity(self) -> NDArray[np.float64]:
-        return self.alpha if self.nodes is None else np.where(self.alpha > 1, 4 * self.alpha - 3, self.alpha)
 
 
 @dataclass(frozen=True)
@@ -76,11 +65,7 @@ class Traversed:
 
 @dataclass(frozen=True)
 class PageUpdate:
-    """A chunk of a paged tree that is loaded into a page, or removed from it.
-
-    Attributes:
-        words: four words a node of the chunk; None removes it.
-    """
+    """A chunk of a paged tree that is loaded into a page, with four words a node, or removed from it (None)."""
 
     tree: int
     chunk: int

@@ -33,10 +33,8 @@ from ..spark_codings import LARGEST_END, SCALE_ZERO, SplatEncoding
 from ..statistics import EXACT_BITS, LOWER, SMALL_QUANTILE, UPPER, Distribution, Statistics, fine_bits, tops
 from .property_codings import BLOCK, BY_NAME, CODINGS, GZ, LARGEST_F16, PROPERTIES, Property, Row, encodings_of
 from .rad_header import Files, RadChunkHeader, RadHeader, in_files, in_one_file, pack_chunk_header, padding
-from .rad_reader import RadChunk as RadChunk
 from .rad_reader import RadReader as RadReader
 from .rad_reader import open_content as open_content
-from .rad_reader import read_chunk as read_chunk
 
 #: What "auto" stands for, where the scene does not decide.
 AUTOMATIC = RadOptions("f32_lebytes", "r8", "r8", "ln_0r8", "oct88r8", "s8")
