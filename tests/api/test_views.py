@@ -16,8 +16,6 @@ from tests.commands.cli import NAMED, Cli
 from tests.lod.trees import row_of_regions
 from tests.part_files import write_streamed
 
-pytestmark = pytest.mark.slow
-
 CAMERA = sparklod.Camera.look_at((0.5, -1.0, 4.0), (0.0, 0.0, 0.0), size=(160, 120))
 VIEW, CAMERAS = "--look-at 0.5,-1,4:0,0,0 --size 160x120", "sparklod.json"
 
@@ -45,6 +43,7 @@ def test_a_cut_is_within_its_budget(scene: sparklod.Scene, held: sparklod.Tree) 
     assert len(sparklod.cut(scene, CAMERA, budget=300)) == len(scene)  # of a scene without a tree
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float16", "ext", "packed"])
 def test_cuts_in_another_precision_are_those_of_the_command(
     precision: str, file: Path, held: sparklod.Tree, cli: Cli
@@ -71,6 +70,7 @@ def test_pictures_are_those_of_the_command(file: Path, held: sparklod.Tree, cli:
         assert np.array_equal(ours, np.load("a.npy"))
 
 
+@pytest.mark.slow
 def test_rows_are_those_of_the_command(file: Path, held: sparklod.Tree, cli: Cli) -> None:
     cli(f"traverse {file} --camera-path {CAMERAS} --budget 300 --no-timing -o a.csv")
     cameras, theirs = sparklod.read_cameras(NAMED[CAMERAS]), rows_of("a.csv")
@@ -89,6 +89,7 @@ def test_rows_are_those_of_the_command(file: Path, held: sparklod.Tree, cli: Cli
     assert without_time(one) == without_time(three)
 
 
+@pytest.mark.slow
 def test_a_comparison_is_that_of_the_command(scene: sparklod.Scene, file: Path, held: sparklod.Tree, cli: Cli) -> None:
     cli(f"render {file} {VIEW} --compare --budget 5%,300 -o a.csv")
     table = sparklod.compare(held, None, [CAMERA], budgets=[0.05, 300])

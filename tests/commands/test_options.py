@@ -113,6 +113,8 @@ class Example(CheckedSettings):
         (Example, "angle", 180, ValueError, "angle is 180; give more than 0 and less than 180"),
         (RadOptions, "sh_codes", 1, ValueError, "sh_codes is 1; give 2 to 65536"),
         (SogOptions, "sh_codes", 1, ValueError, "sh_codes is 1; give 2 to 65536"),
+        (TileSettings, "lat", 47, ValueError, "lat and lon go together; give both"),
+        (TileSettings, "heading", 47, ValueError, "height and heading are of a place; give lat and lon, too"),
         (RadOptions, "center_bits", 150, ValueError, "center_bits is 150; give -149 to 149"),
         (RadOptions, "center_bits", 1.5, TypeError, r"center_bits is 1\.5; give a whole number"),
     ],

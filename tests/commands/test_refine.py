@@ -20,8 +20,6 @@ from tests.fittings import STEPS, StandIn
 from tests.fittings import stand_in as stand_in
 from tests.signals import heed_signals
 
-pytestmark = pytest.mark.slow
-
 SMALL, CAMERAS = "sh2.ply", "x,y,z,target_x,target_y,target_z\n0,0,-3,0,0,0\n0,1,-3,0,0,0\n"
 
 
@@ -60,6 +58,7 @@ def test_reports_have_the_gain_of_each_stage(cli: Cli, stand_in: StandIn) -> Non
     assert "quick tree, refined -> SPZ" in err
 
 
+@pytest.mark.slow
 def test_a_scene_that_no_camera_sees_is_reported(cli: Cli) -> None:
     said = "refined in 0 steps: no held-out camera sees anything of it; 0 % of the splats fitted have new values\n"
     assert said in cli("build-lod one.ply --refine -o a.spz").err
@@ -194,6 +193,7 @@ def interrupted(folder: Path, *signals: int, heeds: bool = True, kept: float = 0
     return re.sub(r".* % done after .*\n", "", err).lstrip()
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_the_gain_of_the_finished_stages(tmp_path: Path) -> None:
     err = interrupted(tmp_path, signal.SIGINT)
     assert err.endswith("interrupted\n") and "writing the improvements of the finished stages" in err
@@ -202,6 +202,7 @@ def test_ctrl_c_keeps_the_gain_of_the_finished_stages(tmp_path: Path) -> None:
     assert path.name == "sh2-lod.spz" and read_scene(path).tree is not None
 
 
+@pytest.mark.slow
 def test_ctrl_c_without_a_gain_or_a_second_one_leaves_nothing(tmp_path: Path) -> None:
     err = interrupted(tmp_path, signal.SIGINT, kept=0)
     assert err.endswith("\ninterrupted\n") and "Stopped before --refine improved anything; no file written." in err

@@ -28,11 +28,6 @@ from tests.conftest import FIXTURES
 TREE, TOWN, PLAIN, DEMO = "hand-tree-v3.spz", "town.spz", "sh2.ply", "demo.ply"
 SIZE, AT = "--size 160x90", "--look-at 0,-3,9:0,0,0"
 CAMERAS = sorted(path.name for path in (FIXTURES / "cameras").iterdir())
-SCENES = sorted(
-    path.name
-    for path in (*FIXTURES.glob("*.ply"), *FIXTURES.glob("golden/*"))
-    if path.suffix in (".ply", ".spz", ".splat", ".ksplat", ".sog") and path.stem not in ("huge", "flat", "points")
-)
 
 
 def pixels(path: Path | str | io.BytesIO) -> np.ndarray:
@@ -71,12 +66,6 @@ def test_a_picture_is_beside_the_scene_and_has_its_name_or_is_named(cli: Cli) ->
         cli(f"render {source} {SIZE} -q")
     made = {"sh2.png", "town 100_.0000.png", "town 100_.0001.png", "unpacked.png", "unpacked/unpacked.png"}
     assert made < {*cli.made()}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SCENES)
-def test_every_format_is_drawn(name: str, cli: Cli) -> None:
-    cli(f"render {name} --size 64x48 -q -o x.png")
 
 
 @pytest.mark.slow
@@ -137,10 +126,9 @@ def test_color_by_draws_a_color_scale(by: str, cli: Cli) -> None:
     assert floats("x.npy").shape == ((270, 480) if by in ("overdraw", "depth") else (270, 480, 4))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("style", STYLES)
 def test_every_style_draws_something(style: str, cli: Cli) -> None:
-    cli(f"render {TOWN} --budget 4k {SIZE} -q --style {style} -o x.png")
+    cli(f"render {TREE} --size 64x48 -q --style {style} -o x.png")
     assert pixels("x.png").any()
 
 

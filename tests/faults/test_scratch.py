@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -172,22 +171,6 @@ def test_a_bake_whose_output_is_in_place_is_resumed(
     bakes(DEMO, target, settings, resources=resources)
     assert target.read_bytes() == whole["quick", ".rad"]
     assert not (tmp_path / f"out.rad{SUFFIX}").exists()
-
-
-def test_results_that_somebody_removed_are_an_error_that_says_what_helps(
-    tmp_path: Path, whole: dict[tuple[str, str], bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    target, scratch = tmp_path / "out.rad", tmp_path / "scratch"
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        stop_at_the_end(patch)
-        baked(target, scratch)
-    target.unlink()
-    shutil.rmtree(next(scratch.iterdir()) / "encoded")
-    shutil.rmtree(next(scratch.iterdir()) / "families")
-    with pytest.raises(ScratchError, match=r"^families/\d+ is missing in the scratch folder .*anew with --overwrite"):
-        baked(target, scratch, resume=True)
-    baked(target, scratch, overwrite=True)
-    assert target.read_bytes() == whole["quick", ".rad"]
 
 
 def test_leftover_results_are_refused_or_removed_and_no_file_of_others_is_replaced(tmp_path: Path) -> None:
