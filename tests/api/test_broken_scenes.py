@@ -240,9 +240,7 @@ def spoiled(scene: Scene, wrong: str) -> Scene:
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_invalid_splats_are_neither_written_nor_built_nor_fitted(
-    wrong: str, scene: Scene, tree: Tree, tmp_path: Path
-) -> None:
+def test_invalid_splats_are_not_written_built_or_fitted(wrong: str, scene: Scene, tree: Tree, tmp_path: Path) -> None:
     plain, nodes = spoiled(scene, wrong), spoiled(tree, wrong)
     for whole, ways in ((plain, PLAIN), (nodes, TREES)):
         for name, options in ways.items():

@@ -35,7 +35,7 @@ DEMO = "demo.ply"
 # --- Scenes and trees -------------------------------------------------------------------------------------------------
 
 
-def test_a_tree_is_read_as_a_tree_and_its_leaves_are_the_scene(
+def test_a_tree_is_read_as_one_and_its_leaves_are_the_scene(
     scene: Scene, tree: sparklod.Tree, held: sparklod.Tree
 ) -> None:
     assert isinstance(held, sparklod.Tree)
@@ -89,7 +89,7 @@ def test_a_report_is_that_of_inspect(file: Path, cli: Cli) -> None:
 
 
 @pytest.mark.parametrize(("encoding", "near", "coarse"), [("packed", 2**-11, 0.045), ("ext", 0.0, 0.006)])
-def test_arrays_of_viewers_are_unpacked(
+def test_viewer_arrays_are_unpacked(
     encoding: str, near: float, coarse: float, scene: Scene, tree: sparklod.Tree
 ) -> None:
     again = sparklod.unpack(sparklod.pack(tree, encoding) | sparklod.pack(tree, "lodtree"))

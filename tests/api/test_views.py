@@ -45,7 +45,7 @@ def test_a_cut_is_within_its_budget(scene: sparklod.Scene, held: sparklod.Tree) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float16", "ext", "packed"])
-def test_cuts_in_another_precision_are_those_of_the_command(
+def test_cuts_in_a_precision_are_those_of_the_command(
     precision: str, file: Path, held: sparklod.Tree, cli: Cli
 ) -> None:
     """A tree that was read knows how its file holds scales."""
@@ -113,9 +113,7 @@ def test_instances_stand_where_they_are_put(held: sparklod.Tree) -> None:
     assert [row["instance"] for row in unnamed] == ["total", "scene", "scene 2"]
 
 
-def test_tables_are_shown_in_notebooks_and_become_data_frames(
-    held: sparklod.Tree, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tables_are_shown_in_notebooks_and_data_frames(held: sparklod.Tree, monkeypatch: pytest.MonkeyPatch) -> None:
     frames = sparklod.traverse(held, [CAMERA] * 30, budget=300)
     html = frames._repr_html_()
     assert html.count("<tr>") == 1 + 20 + 1 and "…" in html and repr(frames) in html

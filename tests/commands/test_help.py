@@ -268,9 +268,7 @@ def test_installing_adds_one_line(shell: str, home: Path, cli: Cli, monkeypatch:
         assert path.read_text() == f"alias ll='ls -l'\n{line.format(program=said)}\n"
 
 
-def test_the_program_of_a_module_is_the_one_beside_its_python(
-    home: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_program_of_a_module_is_beside_its_python(home: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["/opt/sparklod_cli/__main__.py"])
     monkeypatch.setattr(sys, "executable", str(home / "python"))
     (home / "sparklod").touch()

@@ -298,9 +298,7 @@ def test_colours_replace_those_of_the_splats(cli: Cli) -> None:
         ("a.npy", np.array([{}] * COUNT), "is not a .npy file"),
     ],
 )
-def test_colours_of_a_wrong_shape_or_type_are_refused(
-    name: str, values: np.ndarray, message: str, tmp_path: Path
-) -> None:
+def test_colours_of_another_shape_are_refused(name: str, values: np.ndarray, message: str, tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=message):
         read_rgba(save(tmp_path / name, values), COUNT)
 

@@ -52,9 +52,7 @@ def test_a_report_is_on_standard_output_and_has_the_parts_that_options_name(cli:
     ("file", "without", "with_check"),
     [(TREE, 0, 0), (CORRUPT, 1, 3), ("missing.spz", 1, 3), (BROKEN, 0, 3), (WARNED, 0, 0), (NOTED, 0, 0)],
 )
-def test_the_exit_status_says_whether_a_file_was_read_and_checked(
-    file: str, without: int, with_check: int, cli: Cli
-) -> None:
+def test_the_exit_status_says_whether_a_file_is_sound(file: str, without: int, with_check: int, cli: Cli) -> None:
     for form in ("", "--json"):
         cli(f"inspect {file} {form}", status=without)
         cli(f"inspect {file} --check {form}", status=with_check)

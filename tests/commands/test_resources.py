@@ -83,9 +83,7 @@ def test_too_little_memory_is_an_error_that_says_how_much_is_enough(cli: Cli) ->
         ("-o web/tileset.json", "tiles are made of a whole tree"),
     ],
 )
-def test_a_bake_that_needs_a_whole_tree_is_refused_with_the_memory_that_is_enough(
-    options: str, why: str, cli: Cli
-) -> None:
+def test_a_bake_of_a_whole_tree_names_the_memory_that_is_enough(options: str, why: str, cli: Cli) -> None:
     err = cli(f"build-lod demo.ply {options} --memory 3M", status=1).err
     assert f"demo.ply: {why}, not in blocks: " in err
     found = re.search(r"3\.0 MB are enough for [1-9][\d,]+; give --memory (.*) or more if the machine has it", err)
