@@ -203,8 +203,6 @@ def test_a_pipe_without_a_reader_is_exit_status_1(line: str, pipe: int) -> None:
     assert sum(text.startswith("error: ") for text in done.stderr.splitlines()) <= 1
 
 
-
-
 @pytest.mark.parametrize(
     ("name", "closed"),
     [("build-lod", "2>&-"), ("build-lod", "<&- >&- 2>&-"), ("traverse", ">&-"), ("render", ">&- 2>&-")],
