@@ -187,7 +187,7 @@ def refuse_output_among_inputs(ctx: click.Context, *, missing: bool = False) -> 
         is_tree = last.suffix.lower() in TREES and len(others) == 1 and others[0].suffix.lower() not in TREES
         if ctx.command.name != "build-lod" or not is_tree:
             return
-        error = "{} exists, and is taken for an input; did you mean {} {}?"
+        error = "{} exists, so it is an input; did you mean {} {}? To bake both files, give --output-dir"
     import shlex  # needed after a mistake only
 
     for name, suffixes in OTHER_OUTPUTS.items():

@@ -234,7 +234,7 @@ HABITS = [
             ("inspect sh0.ply tree-v3.spz report.HTM", "--html", 3),
         )
     ),
-    ("build-lod sh0.ply tree-v3.spz", "tree-v3.spz exists, and is taken for an input; did you mean -o tree-v3.spz?"),
+    ("build-lod sh0.ply tree-v3.spz", "tree-v3.spz exists, so it is an input; did you mean -o tree-v3.spz?"),
     ("view sh0.ply site/", "error: site does not exist; did you mean --export site?"),
     ("simplify sh0.ply --to 10 % -o a.ply", "10 % has a blank before its unit; write 10%"),
     ("simplify sh0.ply --to=10 % -o a.ply", "--to=10 % has a blank before its unit; write --to=10%"),
