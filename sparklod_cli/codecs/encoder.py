@@ -22,7 +22,7 @@ from . import quantize
 from .options import WriteOptions
 
 if TYPE_CHECKING:
-    from typing import Protocol, Self  # Python 3.10 has no Self
+    from typing import Protocol
 
     class Encoder(Protocol):
         """Encoder of the windows of one file, which can be pickled."""
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
         def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
             """Return the bytes of the file, piece by piece, made of the results of all windows."""
 
-        def keeping(self, stored: Any, unchanged: NDArray[np.bool_]) -> Self:
+        def keeping(self, stored: Any, unchanged: NDArray[np.bool_]) -> Encoder:
             """Return an encoder that gives (N,) unchanged nodes their codes of a file, by the codec's `stored`."""
 
 
