@@ -29,7 +29,6 @@ from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
 from sparklod_cli.codecs.rad.rad_reader import read_chunk
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
-from sparklod_cli.inspection.tree import examine
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.gaussian import lod_opacity
@@ -39,7 +38,6 @@ from sparklod_cli.model.splats import COLUMNS, FloatArray, Splats
 from tests.codecs.cases import encode, linear, rotation_degrees
 from tests.codecs.writers import as_ply
 from tests.conftest import FIXTURES, Capture, real_scene
-from tests.inspection.test_tree_facts import check_facts
 from tests.interop.node import PROGRAMS
 from tests.interop.spark import Spark
 from tests.interop.spark_words import (
@@ -419,8 +417,9 @@ def test_trees_of_spark_have_no_faults(spark: Spark, tmp_path: Path, capsys: Cap
     code, report = inspected(path, capsys, "--fail-on", "warning")
     scene = read_scene(path)
     assert scene.tree is not None and code == 0
-    check_facts(scene.splats, scene.tree, examine(scene.splats, scene.tree)[0])
-    assert report["tree"]["leaves"] == len(read_scene(source).splats)
+    facts, leaves = report["tree"], len(read_scene(source).splats)
+    assert (report["splats"], facts["leaves"], facts["inner"]) == (len(scene), leaves, len(scene) - leaves)
+    assert facts["depth"] == scene.tree.depths().max()
     # The first 65,536 nodes are coarse before fine. The others follow part by part of the scene, which is a note.
     assert [finding["code"] for finding in report["findings"]] == ["tree.coarse-first"] * (len(scene) > CHUNK_NODES)
     assert all(finding["index"] > CHUNK_NODES for finding in report["findings"])
