@@ -27,7 +27,7 @@ from ..system.threads import blocks_of, ordered_map
 from ..system.untrusted import quoted, quoted_value
 from . import quantize
 from .formats import ZIP
-from .reader import HARMLESS, OpenFile, Reader, Target, left_out
+from .reader import HARMLESS, OpenFile, Reader, RowBuffer, left_out
 from .zip_folder import ZIP_ERRORS
 
 #: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
@@ -114,7 +114,7 @@ def open_content(source: OpenFile) -> Reader:
     degree = COEFFICIENTS.index(values // 3)
     notes = notes_on_degree(degree) + left_out("tensor", "tensors", _others(root, {*known, *HARMLESS}))
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
         def read(part: slice) -> slice:
             for each in stored:

@@ -61,7 +61,7 @@ from .gltf_container import (
 )
 from .merging import copy_rows
 from .options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
-from .reader import FileNote, OpenFile, Reader, Target, encode_rows, left_out, note_of, read_note
+from .reader import FileNote, OpenFile, Reader, RowBuffer, encode_rows, left_out, note_of, read_note
 
 #: Extensions that a file may require, and how those begin that change no splats: materials and lights are ignored.
 READ = (EXTENSION, COMPRESSION, OLD_COMPRESSION, "KHR_mesh_quantization")
@@ -236,7 +236,7 @@ def _plain_content(file: GltfFile, primitive: dict[str, Any], generator: object)
     elif doubt := doubt_about(scales, centers, count):
         notes.append(doubt)
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         with file.readers({accessor.buffer for _, accessor in accessors}) as readers:
 
             @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
@@ -267,10 +267,10 @@ def _reopened(opened: Callable[[], Reader]) -> Reader:
     """Return a content that decodes all splats at the first read, and keeps them until the last row was read."""
     content, held = opened(), list[Splats]()
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         if not held:
             splats = Splats.empty(content.count, content.sh_degree)
-            opened().fill(Target(splats), threads, progress)
+            opened().fill(RowBuffer(splats), threads, progress)
             held.append(splats)
         copy_rows(held[0].take(slice(target.start, target.stop)), target.splats)
         if target.stop == content.count:
@@ -283,12 +283,12 @@ def _joined(contents: Sequence[Reader]) -> Reader:
     """Return the splats of several contents as one; SH coefficients that one does not have become 0."""
     degree = max(content.sh_degree for content in contents)
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         done = 0
         for number, part, rows in target.shares(content.count for content in contents):
             content = contents[number]
             own = rows if content.sh_degree == degree else Splats.empty(len(rows), content.sh_degree)
-            content.fill(Target(own, part.start, columns=target.columns), threads, silent)
+            content.fill(RowBuffer(own, part.start, columns=target.columns), threads, silent)
             if own is not rows:
                 copy_rows(own, rows)
             done += len(rows)
@@ -305,7 +305,7 @@ def placed(content: Reader, transform: Transform) -> Reader:
         return content
     axes = ("center", "scale", "quat_xyzw", "sh")
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         content.fill(target, threads, progress)
         turned = transform.apply(target.splats)
         for name in axes:

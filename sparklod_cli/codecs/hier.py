@@ -20,7 +20,7 @@ from ..system.errors import FormatError, TruncatedError
 from ..system.progress import Progress
 from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
 from . import quantize
-from .reader import OpenFile, Reader, Target, rows_of
+from .reader import OpenFile, Reader, RowBuffer, rows_of
 
 #: Before the columns, the number of splats, negative where numbers are halves; before the nodes, their number.
 COUNT = np.dtype("<i4")
@@ -72,7 +72,7 @@ def open_content(source: OpenFile) -> Reader:
         raise TruncatedError(f"cut short, or no .hier: it announces {count:,} splats in {nodes:,} nodes")
     leaves = _leaves(source, nodes_at + COUNT.itemsize, node, nodes, count)
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
         def read(part: slice) -> int:
             first, last = np.searchsorted(rows, [part.start, part.stop])

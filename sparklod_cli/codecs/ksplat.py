@@ -22,7 +22,7 @@ from ..system.progress import Progress
 from ..system.threads import ordered_map
 from ..system.units import count_of
 from . import quantize
-from .reader import OpenFile, Reader, Rows, Target, rows_of
+from .reader import OpenFile, Reader, RowBuffer, Rows, rows_of
 
 HEADER = np.dtype(
     {
@@ -129,7 +129,7 @@ def open_content(source: OpenFile) -> Reader:
                 yield slice(section.first + part.start, section.first + part.stop), some
 
     @np.errstate(invalid="ignore", over="ignore")  # absurd numbers overflow
-    def unpack(target: Target, block: Rows) -> int:
+    def unpack(target: RowBuffer, block: Rows) -> int:
         part, some = block
         splats = target.rows(part)
         section = sections[bisect(firsts, part.start) - 1]
@@ -150,7 +150,7 @@ def open_content(source: OpenFile) -> Reader:
         splats.sh[:, coefficients:] = 0  # the degree of other sections may be higher
         return part.stop
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         for done in ordered_map(functools.partial(unpack, target), rows(target.start, target.stop), threads):
             progress("reading", done, count, "splat")
 

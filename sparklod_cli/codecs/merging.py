@@ -18,7 +18,7 @@ from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..system.units import count_of
 from ..system.untrusted import quoted_value
-from .reader import Fill, OpenCompanion, OpenFile, Reader, Target
+from .reader import Fill, OpenCompanion, OpenFile, Reader, RowBuffer
 from .rules import RuleViolation, error_of
 
 
@@ -75,7 +75,7 @@ class _FillMerged:
 
     parts: tuple[Placed, ...]
 
-    def __call__(self, target: Target, threads: int, progress: Progress) -> None:
+    def __call__(self, target: RowBuffer, threads: int, progress: Progress) -> None:
         done = 0
         for number, rows, out in target.shares(part.reader.count for part in self.parts):
             part, at = self.parts[number], 0
@@ -133,7 +133,7 @@ class SceneFiles:
         size = content.header.get("bytes", source.size)
         pieces = ((0, content.count, row),) if pieces is None else tuple(pieces)
 
-        def fill(target: Target, threads: int, progress: Progress) -> None:
+        def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
             with self._opened(name) as source:
                 content = self.open_content(name, source)
                 if (content.count, content.sh_degree) != expected:
@@ -172,7 +172,7 @@ class SceneFiles:
         count = sum(chunk.rows for chunk in chunks)
         last: dict[int, Splats] = {}  # of the file that was read last, by its number
 
-        def fill(target: Target, threads: int, progress: Progress) -> None:
+        def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
             if len(target.splats) == count:
                 self.read(chunks, target.splats, threads, progress)
                 return

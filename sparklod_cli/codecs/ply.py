@@ -36,8 +36,8 @@ from .reader import (
     Note,
     OpenFile,
     Reader,
+    RowBuffer,
     Rows,
-    Target,
     comment_of,
     encode_rows,
     left_out,
@@ -257,7 +257,7 @@ def open_content(source: OpenFile) -> Reader:
     rest_places = _places(names, rest)
     text_rows = functools.partial(_text_rows, file, header, row_type, needed)
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         span = row_type, target.start, target.stop, count, "vertices"
         if not header.text:
             rows = rows_of(source.read_at, offset, *span)
@@ -322,7 +322,7 @@ def _columns(names: Collection[str], mode: str) -> dict[str, tuple[tuple[str, ..
 
 # Converters write infinite logits and logarithms for an opacity of 0 or 1 and a scale of 0.
 @np.errstate(over="ignore", invalid="ignore")
-def _unpack(target: Target, places: Mapping[str, tuple[Places, Coding]], rest_places: Places, block: Rows) -> int:
+def _unpack(target: RowBuffer, places: Mapping[str, tuple[Places, Coding]], rest_places: Places, block: Rows) -> int:
     """Fill splats from a block, by the places and the decode of each column, and the places of SH, red first."""
     part, rows = block
     splats, names = target.rows(part), rows.dtype.names or ()
@@ -477,7 +477,7 @@ def _open_compressed(source: OpenFile, header: PlyHeader) -> Reader:
 
     bounds = _bounds(read("chunk", 0, -(-count // CHUNK_SPLATS)))
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         @np.errstate(invalid="ignore", over="ignore")  # absurd bounds overflow
         def unpack(block: Rows) -> int:
             part, rows = block

@@ -125,7 +125,7 @@ BLOCK_SPLATS = 1 << 17
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class RowBuffer:
     """Rows of a file to fill.
 
     Attributes:
@@ -166,7 +166,7 @@ class Target:
 
 
 #: Reads and decodes rows on some threads; raises `FormatError` if the file is cut short or corrupt.
-Fill = Callable[[Target, int, Progress], None]
+Fill = Callable[[RowBuffer, int, Progress], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,11 +211,14 @@ class Reader:
         *,
         once: bool = False,
     ) -> tuple[Splats, LodTree | None]:
-        """Read a range of splats, and their nodes in a file with a tree; other columns may be 0. `once` as `Target`."""
+        """Read a range of splats, and their nodes in a file with a tree; other columns may be 0.
+
+        `once` is that of `RowBuffer`.
+        """
         splats, tree = Splats.zeros(stop - start, self.sh_degree), None
         if self.has_tree:
             tree = LodTree(np.empty(stop - start, np.uint16), np.empty(stop - start, np.uint32))
-        self.fill(Target(splats, start, tree, columns, once), self.threads, progress)
+        self.fill(RowBuffer(splats, start, tree, columns, once), self.threads, progress)
         return splats, tree
 
     def scene(self, *, columns: Collection[str] = COLUMNS, progress: Progress = silent, validate: bool = True) -> Scene:

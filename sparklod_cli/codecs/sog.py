@@ -35,7 +35,7 @@ from .compression import check_promise
 from .formats import META, SOG_IMAGES
 from .kernels import texels
 from .options import DEFAULTS, MAX_SH_CODES, WriteOptions
-from .reader import Note, OpenCompanion, OpenFile, Reader, Target, note_of, read_note, size_of
+from .reader import Note, OpenCompanion, OpenFile, Reader, RowBuffer, note_of, read_note, size_of
 from .sog_images import (
     MAX_SIDE,
     Pixels,
@@ -248,7 +248,7 @@ def open_content(source: OpenFile) -> Reader:
         for step in in_order():
             yield files.pixels(step.texture, step.number, count).tobytes()
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         if palette is not None:
             palette.values()
         scratch = None if source.scratch is None or target.once else source.scratch(unpacked)

@@ -15,7 +15,7 @@ from ..system.threads import ordered_map
 from . import quantize
 from .encoder import CodeRange
 from .options import DEFAULTS, WriteOptions
-from .reader import OpenFile, Reader, Rows, Target, encode_rows, rows_of
+from .reader import OpenFile, Reader, RowBuffer, Rows, encode_rows, rows_of
 
 ROW = np.dtype(
     [
@@ -39,7 +39,7 @@ def open_content(source: OpenFile) -> Reader:
         raise TruncatedError(f"cut short, or not .splat: its {size:,} bytes are not a multiple of {ROW.itemsize}")
     count = size // ROW.itemsize
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         def decode_block(block: Rows) -> int:
             part, rows = block
             splats = target.rows(part)

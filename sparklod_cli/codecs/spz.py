@@ -35,7 +35,7 @@ from .encoder import CLAMPED, SPZ_RANGES, CodeRange, Encoded, Windows, results, 
 from .formats import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
 from .options import DEFAULTS, WriteOptions
 from .quantize import ALL_BITS, Bytes
-from .reader import FileNote, OpenFile, Read, Reader, Scratch, Target, comment_of, read_comment, rows_of
+from .reader import FileNote, OpenFile, Read, Reader, RowBuffer, Scratch, comment_of, read_comment, rows_of
 from .statistics import Statistics, enough, fine_bits
 
 MAGIC = 0x5053474E  # "NGSP"
@@ -144,7 +144,7 @@ def open_content(source: OpenFile) -> Reader:
     """
     layout, rows, header, note, (axis, notes, has_system) = open_streams(source.file, source.size)
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         def decode(item: StreamRows) -> int:
             stream, part, codes = item
             if stream.column in target.columns or stream.column not in COLUMNS:
@@ -184,7 +184,7 @@ def open_content(source: OpenFile) -> Reader:
 
 
 def _unpacked_rows(
-    scratch: Scratch, layout: Layout, rows: Iterator[StreamRows], target: Target
+    scratch: Scratch, layout: Layout, rows: Iterator[StreamRows], target: RowBuffer
 ) -> Iterator[StreamRows]:
     """Yield the rows of a target from a scratch file of all streams, which is made first if it does not exist."""
     file, offset = scratch(lambda: (codes.tobytes() for _, _, codes in rows)), 0

@@ -66,7 +66,7 @@ from .outputs import (
 from .rules import check, is_set
 
 if TYPE_CHECKING:
-    from ..api.trees import Outcome, Pair
+    from ..api.bake_jobs import Outcome, Pair
     from ..bake.converting import Converted
     from ..bake.settings import Baked, BakeSettings, Source
     from ..codecs.losses import Clamp, Losses
@@ -264,7 +264,7 @@ class BuildLodOptions:
 
     @property
     def target(self) -> Target:
-        """What the names and --format say about the outputs; a refined RAD file stays one."""
+        """Target that --output, --output-dir and --format describe; refined RAD files stay RAD."""
         target = Target.of(self.output, self.form, self.output_dir)
         if self.refine is None or self.form is not None or target.kind == "file":
             return target
@@ -347,7 +347,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     instances = _check(ctx, options, target)
     failed, console = False, Console(quiet=general.quiet, verbose=general.verbose)
     with console, contextlib.ExitStack() as stack:
-        from ..api.trees import bake_files, merged_source
+        from ..api.bake_jobs import bake_files, merged_source
 
         pairs: Sequence[Pair] = [(source, options.output_of(source, target)) for source in options.inputs]
         if target.file is not None and (options.merge or options.scene is not None):

@@ -1,49 +1,35 @@
-"""Options that several commands have: general ones, scenes and how they are written, cameras, cuts and inputs."""
+"""Options that several commands have: general ones, tables, scenes and how they are written."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import itertools
-import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ..cameras import DEFAULT_SIZE, ELEVATION, ORBIT
-from ..cameras.camera_formats import FORMATS, Axes
-from ..codecs.formats import PRECISIONS
 from ..codecs.options import SogOptions, WriteOptions
-from ..lod.budget import LARGEST, Budget, parse_budgets
 from ..lod.tree_settings import BUILDERS
 from ..model import UP_AXES
-from ..model.foveation import BEHIND_FOVEATE, CONE_FOV, CONE_FOV0, CONE_FOVEATE, Cones, Foveation, Frustum
-from ..system.errors import CHECK_FAILED, CameraPathError, TooManyCamerasError
-from ..system.setting_fields import Quantity, Range, setting, whole
+from ..system.errors import CHECK_FAILED
+from ..system.setting_fields import Range, setting, whole
 from ..system.stdio import DASH
-from ..system.units import check_grouping, parse_size
-from ..system.untrusted import printable
-from ..viewers.viewer_settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS, LodSettings, Network
-from .command import BALL, COMMON, DIRECTION, GENERAL, POINT, SIZE, VIEW, VIEWS, flag, parameters_of
+from ..system.units import parse_size
+from .command import BALL, COMMON, GENERAL, POINT, flag, parameters_of
 from .console import Console, is_terminal
-from .outputs import Form, NamedPath, file_of, require_suffix
-from .rules import check, flags_set, is_set
+from .outputs import Form, NamedPath, require_suffix
+from .rules import flags_set
 
 if TYPE_CHECKING:
     from ..bake.settings import BakeSettings
-    from ..cameras.camera import Matrix
-    from ..cameras.sources import CameraPath
-    from ..model.instances import Instance
     from ..model.transforms import Transform
-    from ..render.render_settings import RenderSettings
     from ..tables.assertions import Outcome
     from ..tables.columns import Column, TableOutput
-    from ..viewers.scenes import Scenes
 
 #: Headings of `--help` of options of scenes.
 SELECTION, POSITION, FILE_FORMAT = "Selection", "Rotation, scale and position", "File format"
@@ -257,309 +243,3 @@ def memory_size(text: str) -> int:
     if size < 1:
         raise ValueError(f"{text!r} must be positive, such as 4G")
     return size
-
-
-# Cameras and cuts
-
-#: Sources of cameras whose coordinates are given, so that nothing about them is chosen for the scene.
-FIXED = ("camera_path", "look_at", "views", "keyframes")
-
-#: Characters of a --world-transform given as numbers; any other text names a file.
-NUMERIC = set("0123456789+-.,eE ")
-
-#: Help and range of `--orbit`.
-AROUND_SCENE = "Place N cameras around the scene.  [default, without any source of cameras: "
-CAMERAS = whole(1, 1 << 20)
-
-
-@dataclass(frozen=True)
-class Cameras:
-    """Values of the options of cameras; None for those not given."""
-
-    HEADING: ClassVar[str] = "Cameras"
-
-    camera_path: Path | None = setting(
-        "Read the cameras from a file, or from a folder written by COLMAP.", NamedPath(), heading=COMMON
-    )
-    orbit: int | None = setting(f"{AROUND_SCENE}an orbit of {ORBIT}]", CAMERAS, heading=COMMON)
-    look_at: Any = setting("Place one camera at EYE that looks at TARGET, each x,y,z.", VIEW, heading=COMMON)
-    size: tuple[int, int] | None = setting(
-        "Width and height of the images, in pixels; the vertical field of view is kept."
-        f"  [default: the file's, or {DEFAULT_SIZE[0]}x{DEFAULT_SIZE[1]}]",
-        SIZE,
-        heading=COMMON,
-    )
-    dolly: bool = flag("Move the camera straight towards the scene, from far to near.")
-    keyframes: Any = setting(
-        "Move the camera smoothly through two or more views, separated by spaces or semicolons.", VIEWS
-    )
-    camera_format: str | None = setting(
-        f"Format of --camera-path: {', '.join(form.name for form in FORMATS)}, or auto, which recognises it by its"
-        " content.  [default: auto]",
-        ("auto", *(form.name for form in FORMATS)),
-        metavar="FORMAT",
-    )
-    camera_axes: str | None = setting(
-        "Axes of the matrices of --camera-path: y up (opengl) or down (opencv), camera to world (c2w) or world to"
-        " camera (w2c).  [default: those of its format]",
-        tuple(axes.value for axes in Axes),
-    )
-    center: tuple[float, ...] | None = setting(
-        "Point that --orbit and --dolly look at.  [default: the middle of the scene]", POINT
-    )
-    distance: float | None = setting(
-        "Distance from that point, in world units: of --orbit, and of the first camera of --dolly."
-        "  [default: where the scene fits the image; 4 times that with --dolly]",
-        Range(above=0, unit="D"),
-    )
-    elevation: float | None = setting(
-        f"Angle of --orbit and --dolly above that point, in degrees.  [default: {ELEVATION:g}]",
-        Range(-89, 89, unit="DEGREES"),
-    )
-    up: tuple[float, float, float] | None = setting(
-        f"{UP} For cameras of which only eye and target are known.{DEFAULT_UP}; y in SuperSplat's camera files]",
-        DIRECTION,
-        heading=COMMON,
-    )
-    world_transform: str | None = setting(
-        "Transform from the world of the cameras to that of the splats: 16 numbers with commas between, row by row, or"
-        " a file of them.",
-        metavar="MATRIX",
-    )
-    fov: float | None = setting(
-        "Vertical field of view, in degrees.  [default: the file's, or 60]", Range(above=0, below=180, unit="DEGREES")
-    )
-    seconds: float | None = setting(
-        "Duration of --orbit, of --dolly, and of --keyframes from one view to the next, in seconds.  [default: 2; of"
-        " --orbit, N frames at --fps]",
-        Range(above=0, most=1e6, unit="S"),
-    )
-    fps: float | None = setting(
-        "Frames per second of the path; times are counted by it.  [default: the file's times, or 30]",
-        Range(above=0, most=1e6, unit="N"),
-    )
-    every: int = setting("Take every K-th camera of the path.", whole(1, unit="K"), 1)
-    views: tuple[Any, ...] = ()  # an option of pictures alone
-
-    #: Without a source there is one camera that sees the whole scene, in place of an orbit.
-    still: ClassVar[bool] = False
-
-    def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
-        """Return the cameras; scenes are read only where cameras are chosen for them, or need their up axis."""
-        from ..cameras import sources
-        from ..cameras.camera import DEFAULT_SECONDS, Settings
-
-        settings = Settings(
-            axes=Axes(self.camera_axes) if self.camera_axes else None,
-            world=None if self.world_transform is None else _world(self.world_transform),
-            size=self.size,
-            fov_y=None if self.fov is None else math.radians(self.fov),
-            fps=self.fps,
-            every=self.every,
-            up=self.up,
-            up_of_scene=lambda: scenes().up,
-        )
-        if self.camera_path is not None:
-            from ..cameras.camera_files import read_path
-
-            return read_path(self.camera_path, None if self.camera_format == "auto" else self.camera_format, settings)
-        elevation = ELEVATION if self.elevation is None else self.elevation
-        seconds = self.seconds or DEFAULT_SECONDS
-        try:
-            if self.views or self.look_at:
-                return sources.single_views(self.views or (self.look_at,), settings, named=bool(self.views))
-            if self.keyframes:
-                return sources.keyframes(self.keyframes, seconds, settings)
-            if self.dolly:
-                return sources.dolly(seconds, self.center, self.distance, elevation, settings, lambda: scenes().balls())
-            if self.orbit is None and self.still and self.center is None and self.distance is None:
-                return sources.whole_scene(elevation, settings, lambda: scenes().balls())
-            count = self.orbit or (1 if self.still else ORBIT)
-            if self.seconds is not None:
-                settings = replace(settings, fps=count / self.seconds)
-            return sources.orbit(count, self.center, self.distance, elevation, settings, lambda: scenes().balls())
-        except TooManyCamerasError as error:
-            source = next((name for name in ("dolly", "keyframes") if getattr(self, name)), "orbit")
-            raise click.UsageError(f"--{source}: {error}") from None
-
-
-def _world(value: str) -> Matrix:
-    """Return the (4, 4) matrix of --world-transform, which is a text of numbers or names a file."""
-    from ..cameras.camera_files import read_world_transform, similarity
-
-    if "," in value and not set(value) - NUMERIC:
-        try:
-            return similarity(value)
-        except CameraPathError as error:
-            raise click.UsageError(f"--world-transform {error}") from None
-    return read_world_transform(Path(value))
-
-
-#: A key of `PRESETS`.
-DEFAULT_PRESET = "desktop"
-
-#: Angles of cones, and weights of nodes where 1 is that of nodes in the middle.
-DEGREES = Range(0, 180, unit="DEGREES")
-PRIORITY = "of 1, which is that of nodes in the middle"
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """The splat files, each an instance; or an instances file, which names them."""
-
-    HEADING: ClassVar[str] = "Inputs"
-
-    files: tuple[Path, ...] = setting("", NamedPath(), (), argument=True, nargs=-1, metavar="[FILE]...")
-    scene: Path | None = setting(
-        "Read an instances file: JSON that lists splat files and where they stand (see docs/traverse.md).", NamedPath()
-    )
-
-    def instances(self) -> list[Instance]:
-        """Return the instances: each FILE once, untransformed, or those of the instances file."""
-        from ..model.instances import instances_of
-
-        if not self.files and self.scene is None:
-            raise click.UsageError("a FILE is missing; name one, or an instances file with --scene")
-        if self.scene is None:
-            return instances_of(self.files)
-        from ..viewers.instances_file import read_instances
-
-        return read_instances(self.scene)
-
-
-#: Help of `--budget`.
-MOST_DRAWN = "Largest number of splats to draw, such as 500k, or a share of the leaves, such as 5%"
-
-
-@dataclass(frozen=True)
-class CutOptions:
-    """Options of the cuts of trees, and of how detail levels of Streamed SOG are chosen."""
-
-    HEADING: ClassVar[str] = "Cut"
-
-    budget: tuple[Budget, ...] | None = setting(
-        f"{MOST_DRAWN}.  [default: that of --preset]", Quantity("N|P%", parse_budgets), heading=COMMON
-    )
-    preset: str | None = setting(
-        "Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
-        f"  [default: {DEFAULT_PRESET}; for Streamed SOG PlayCanvas's, {PLAYCANVAS_BUDGET:,} splats]",
-        tuple(PRESETS),
-    )
-    lod_splat_scale: float = setting("Factor by which the budget is multiplied.", Range(above=0), 1.0)
-    lod: LodSettings = field(default_factory=LodSettings)
-    cone_fov0: float = setting(
-        "Full angle of the inner foveation cone, in degrees: full priority inside it.", DEGREES, CONE_FOV0
-    )
-    cone_fov: float = setting(
-        "Full angle of the outer cone, in degrees, where priority has fallen to --cone-foveate.", DEGREES, CONE_FOV
-    )
-    cone_foveate: float = setting(f"Priority of nodes at the outer cone, {PRIORITY}.", FACTOR, CONE_FOVEATE)
-    outside_foveate: float | None = setting(
-        "Priority of nodes outside the frustum, in place of the cones, as in Spark's LoD design.", FACTOR
-    )
-    behind_foveate: float | None = setting(
-        f"Priority of nodes behind the camera.  [default: {BEHIND_FOVEATE:g}; 1 with --outside-foveate]", FACTOR
-    )
-    precision: str = setting(
-        "Precision of the centres and sizes that cuts are found with: the file's, its half floats, or what Spark has of"
-        " the file, for the same cuts to the last node: ext with extSplats, else packed, or packed-pages of a RAD file"
-        " that it streams.",
-        PRECISIONS,
-        PRECISIONS[0],
-    )
-
-    #: Options of pictures alone.
-    full: bool = False
-    continuous: bool = False
-    blend: float | None = None
-
-    def one_budget(self) -> Budget:
-        """Return the budget, or that of the preset, times --lod-splat-scale."""
-        if self.budget is not None and len(self.budget) > 1:
-            texts = ",".join(budget.text for budget in self.budget)
-            try:
-                check_grouping(texts)
-            except ValueError as error:
-                raise click.UsageError(f"--budget {error}") from None
-            raise click.UsageError(f"--budget {texts} names several, which only render --compare takes; give one")
-        if self.budget:
-            budget = self.budget[0]
-        else:
-            count = PRESETS[self.preset or DEFAULT_PRESET]
-            budget = replace(Budget.of_count(count), by_default=self.preset is None)
-        scaled = replace(budget, scale=self.lod_splat_scale)
-        if scaled.count is not None and not scaled.count * scaled.scale <= LARGEST:
-            raise click.UsageError(
-                f"the budget must be from 1 to 2^53, not {budget.text} times --lod-splat-scale {scaled.scale:g}"
-            )
-        return scaled
-
-    def settings(self) -> LodSettings:
-        behind = self.behind_foveate
-        if self.outside_foveate is not None:
-            foveation: Foveation = Frustum(self.outside_foveate, 1.0 if behind is None else behind)
-        else:
-            behind = BEHIND_FOVEATE if behind is None else behind
-            foveation = Cones(self.cone_fov0, self.cone_fov, self.cone_foveate, behind)
-        width = (self.blend or BLEND) if self.continuous else None
-        return replace(self.lod, foveation=foveation, continuous=width)
-
-
-def scenes_of(
-    cut: CutOptions, general: General, instances: Sequence[Instance], console: Console, **how: Any
-) -> Callable[[], Scenes]:
-    """Return a function that reads the scenes of instances when it is first called; `how` are further arguments."""
-    from ..viewers.scenes import read_scenes
-
-    how |= {"precision": cut.precision, "threads": general.threads, "progress": console.progress}
-    return functools.cache(functools.partial(read_scenes, instances, **how))
-
-
-def files_read(cameras: Cameras, instances: list[Instance]) -> dict[str, list[Path]]:
-    """For `keep_apart`: by the name of an option, the files that it names without being one."""
-    splats = [each.source for each in instances if isinstance(each.source, Path)]
-    matrix = cameras.world_transform and file_of(cameras.world_transform)
-    return {"scene": splats, "world_transform": [matrix] if matrix else []}
-
-
-def check_view(
-    ctx: click.Context,
-    console: Console,
-    cameras: Cameras,
-    path: CameraPath,
-    scenes: Scenes,
-    network: Network | None = None,
-    notes: Iterable[str] = (),
-) -> None:
-    """Print notes on the cameras, further ones, and those on scenes; refuse options for other kinds of files."""
-    from ..model.scene import up_notes_of
-    from ..viewers.loaded_scene import TREE
-
-    check(ctx, scenes=scenes.kind)
-    upright = cameras.up is None and cameras.camera_path is None  # by the axes of the files
-    for note in (*path.notes, *notes, *(up_notes_of(scenes.axes) if upright else ())):
-        console.say(note)
-    if network is None or network.instant:
-        return
-    trees = [loaded for loaded in scenes.loaded if loaded.kind == TREE]
-    if whole := dict.fromkeys(printable(loaded.name) for loaded in trees if not loaded.has_chunks):
-        names = ", ".join(whole)
-        console.say(
-            f"{names}: loaded whole by viewers before they draw; the waits are those of a RAD with the same nodes"
-        )
-
-
-def with_planes(
-    ctx: click.Context, cameras: Cameras, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]
-) -> RenderSettings:
-    """Return settings whose near and far planes enclose the scenes, where the distance is chosen for them, too.
-
-    So a view of the whole scene clips nothing. Planes that were given stay.
-    """
-    fixed = cameras.distance is not None or any(getattr(cameras, name) for name in FIXED)
-    if fixed or any(is_set(ctx, name) for name in ("near", "far")):
-        return render
-    from ..cameras.framing import reach
-
-    near, far = reach(render.raster.near, render.raster.far, path.cameras, scenes().balls())
-    return replace(render, raster=replace(render.raster, near=near, far=far))

@@ -22,29 +22,21 @@ from ..system.units import format_size, parse_time
 from ..viewers.viewer_settings import BLEND, StreamingSettings
 from .command import COLOR, COMMON, VIEW, Command, flag, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
-from .option_groups import (
-    AROUND_SCENE,
-    ASSERT,
-    CAMERAS,
-    JSON,
-    MOST_DRAWN,
-    OUTPUT,
-    OVERWRITE,
-    PNG,
-    Cameras,
-    CutOptions,
-    General,
-    Inputs,
-    assert_errors,
-    check_view,
-    files_read,
-    report_outcomes,
-    scenes_of,
-    table_output,
-    with_planes,
-)
+from .option_groups import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
 from .outputs import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
 from .rules import check, is_set
+from .viewing_options import (
+    AROUND_SCENE,
+    CAMERAS,
+    MOST_DRAWN,
+    Cameras,
+    CutOptions,
+    Inputs,
+    check_view,
+    files_read,
+    scenes_of,
+    with_planes,
+)
 
 if TYPE_CHECKING:
     from ..api.comparison import BudgetSummary
@@ -294,7 +286,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
         least = -(-(cameras.orbit or 1) // cameras.every)
     _output(ctx, options, least).check([], overwrite=True)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.views import draw_files
+        from ..api.view_jobs import draw_files
         from ..model.instances import instances_of
 
         if budget is not None and (question := doubt(budget.count)):

@@ -1,8 +1,8 @@
-"""Which options of a command go together: one table for all commands, and the function that checks a command line.
+"""Rules for options that exclude or need each other: one table for all commands, and the check of a command line.
 
-A row names parameters, from which flags are made. What is known only once names, formats or files have been looked at
-are facts, which a command gives to `check`. A condition is the name of a parameter, which holds where the option was
-given; or NAME=VALUE, which holds where a parameter or fact has that value.
+A row names parameters, from which flags are made. Facts, which a command passes to `check`, are known only after names,
+formats or files have been examined. A condition is the name of a parameter, which holds if the option was given; or
+NAME=VALUE, which holds if a parameter or fact has that value.
 """
 
 from __future__ import annotations

@@ -125,7 +125,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     general, inputs, output, target = options.general, options.inputs, options.output, Target.of(options.output)
     _check(ctx, options, target)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.trees import bake_files, merged_source
+        from ..api.bake_jobs import bake_files, merged_source
         from ..bake.settings import Baked
         from ..bake.simplifying import SimplifyGoal
 

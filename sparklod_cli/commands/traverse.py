@@ -20,25 +20,10 @@ from ..tables.columns import FORMS
 from ..viewers.viewer_settings import StreamingSettings
 from .command import COMMON, Command, flag, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
-from .option_groups import (
-    ASSERT,
-    JSON,
-    OUTPUT,
-    OVERWRITE,
-    PNG,
-    Cameras,
-    CutOptions,
-    General,
-    Inputs,
-    assert_errors,
-    check_view,
-    files_read,
-    report_outcomes,
-    scenes_of,
-    table_output,
-)
+from .option_groups import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
 from .outputs import NamedPath, claim_stdout, keep_apart, name_outputs
 from .rules import check
+from .viewing_options import Cameras, CutOptions, Inputs, check_view, files_read, scenes_of
 
 if TYPE_CHECKING:
     from ..simulation.results import Summary
@@ -144,7 +129,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
         asserts = [assertions.parse(text, (*results.COLUMNS, *results.LOADING)) for text in options.asserts]
     start = time.perf_counter()
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.views import traverse_files
+        from ..api.view_jobs import traverse_files
         from ..model.splats import COLUMNS
         from ..viewers.loaded_scene import TRAVERSED
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from ..codecs.reader import OpenFile, Reader, Target
+from ..codecs.reader import OpenFile, Reader, RowBuffer
 from ..model.scene import Scene
 from ..model.splats import COLUMNS
 from ..system.addresses import Address, Place, absolute
@@ -227,7 +227,7 @@ class _FillFromFile:
     reader: Reader | None = None
     lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def __call__(self, target: Target, threads: int, progress: Progress) -> None:
+    def __call__(self, target: RowBuffer, threads: int, progress: Progress) -> None:
         with readable():
             reader, version = self.reader, _version(self.path, self.scratch)
             if reader is None or version != self.version:

@@ -14,7 +14,7 @@ import numpy as np
 from sparklod_cli.bake.job import Task
 from sparklod_cli.bake.store import Store
 from sparklod_cli.codecs.merging import copy_rows
-from sparklod_cli.codecs.reader import Reader, Target
+from sparklod_cli.codecs.reader import Reader, RowBuffer
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.system.errors import ScratchError
 from sparklod_cli.system.progress import Progress, silent
@@ -41,7 +41,7 @@ class Loop:
 def reader_of(scene: Scene) -> Reader:
     """A reader of a scene in memory."""
 
-    def fill(target: Target, threads: int, progress: Progress) -> None:
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         copy_rows(scene.splats.take(slice(target.start, target.stop)), target.splats)
 
     return Reader(len(scene), scene.splats.sh_degree, scene.format, fill, scene.antialiased, scene.notes, scene.header)

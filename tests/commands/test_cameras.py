@@ -17,7 +17,7 @@ from sparklod_cli.cameras import sources
 from sparklod_cli.cameras.framing import FILLED, Balls
 from sparklod_cli.cameras.sources import CameraPath
 from sparklod_cli.commands.command import Command, values_of
-from sparklod_cli.commands.option_groups import Cameras
+from sparklod_cli.commands.viewing_options import Cameras
 from sparklod_cli.system.errors import CameraPathError
 from sparklod_cli.system.setting_fields import setting
 from tests.cameras.known import FOLDER, KNOWN, SIZE, check_pose

@@ -11,7 +11,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from sparklod_cli.codecs.merging import Placed, merged
-from sparklod_cli.codecs.reader import Reader, Target
+from sparklod_cli.codecs.reader import Reader, RowBuffer
 from sparklod_cli.model.gaussian import placed
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.model.lod_tree import LodTree
@@ -221,7 +221,7 @@ def test_formats_notes_and_errors_name_their_files() -> None:
     found = merge([one, other, other])
     assert (found.format, found.notes) == ("PLY and SPZ 3", ("no. 0: cut to 3",))
 
-    def broken(target: Target, threads: int, progress: Progress) -> None:
+    def broken(target: RowBuffer, threads: int, progress: Progress) -> None:
         raise FormatError("cut short")
 
     reader = dataclasses.replace(reader_of(one), fill=broken)

@@ -23,7 +23,7 @@ from ...system.threads import ordered_map
 from .. import compression, spark_codings
 from ..compression import INFLATE_ERRORS, raw_unpacker
 from ..quantize import Bytes, quat_of_xyz
-from ..reader import OpenCompanion, OpenFile, Reader, Target, size_of
+from ..reader import OpenCompanion, OpenFile, Reader, RowBuffer, size_of
 from ..rules import RuleViolation, check_rules, error_of
 from .property_codings import BY_NAME, CODINGS, Property, Row, encodings_of
 from .rad_header import (
@@ -179,7 +179,7 @@ class RadReader:
         header, size = self.header, self.header.chunk_size
         codings = [PLAIN_SCALES] * max(len(header.chunks), 1)
 
-        def fill_rows(target: Target, threads: int, progress: Progress) -> None:
+        def fill_rows(target: RowBuffer, threads: int, progress: Progress) -> None:
             def work(packed: PackedChunk) -> int:
                 codings[packed.number] = packed.scale_coding()
                 base, stop = packed.header.base, packed.header.base + packed.header.count
