@@ -24,7 +24,7 @@ from ..system.units import format_size
 from ..system.untrusted import MOST, printable, shortened
 from .command import COMMON, Command, flag, values_of
 from .console import Console, count_of, rows
-from .option_groups import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, assert_errors, table_output
+from .option_groups import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, table_output
 from .outputs import NamedPath, keep_apart, name_outputs
 from .rules import check
 
@@ -104,11 +104,14 @@ class Checks:
             ExpectationError: the file cannot be understood.
         """
         from ..inspection.report import parse_expectation, read_expectations
+        from ..tables.assertions import BadAssertionError
 
         if not self.has_expectations:
             return None
-        with assert_errors():
+        try:
             given = [parse_expectation(text) for text in self.asserts]
+        except BadAssertionError as error:
+            raise click.UsageError(f"--assert {error}") from None
         return [*(read_expectations(self.expect) if self.expect is not None else ()), *given]
 
 

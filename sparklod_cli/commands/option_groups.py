@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import itertools
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -28,7 +27,7 @@ from .rules import flags_set
 if TYPE_CHECKING:
     from ..bake.settings import BakeSettings
     from ..model.transforms import Transform
-    from ..tables.assertions import Outcome
+    from ..tables.assertions import Assertion, Outcome
     from ..tables.columns import Column, TableOutput
 
 #: Headings of `--help` of options of scenes.
@@ -123,13 +122,14 @@ def report_outcomes(console: Console, outcomes: Sequence[Outcome], places: Itera
     return 0 if all(outcome.held for outcome in outcomes) else CHECK_FAILED
 
 
-@contextlib.contextmanager
-def assert_errors() -> Iterator[None]:
-    """Turn the error that an assertion cannot be understood into a usage error that names the option."""
-    from ..tables.assertions import BadAssertionError
+def parse_asserts(texts: Sequence[str], columns: Sequence[Column]) -> list[Assertion]:
+    """Parse the values of --assert; raise a `click.UsageError` for one that cannot be understood."""
+    if not texts:
+        return []
+    from ..tables.assertions import BadAssertionError, parse
 
     try:
-        yield
+        return [parse(text, columns) for text in texts]
     except BadAssertionError as error:
         raise click.UsageError(f"--assert {error}") from None
 

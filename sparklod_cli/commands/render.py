@@ -22,7 +22,7 @@ from ..system.units import format_size, parse_time
 from ..viewers.viewer_settings import BLEND, StreamingSettings
 from .command import COLOR, COMMON, VIEW, Command, flag, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
-from .option_groups import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
+from .option_groups import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, parse_asserts, report_outcomes, table_output
 from .outputs import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
 from .rules import check, is_set
 from .viewing_options import (
@@ -223,7 +223,6 @@ class RenderOptions:
     def assertions(self, budgets: Sequence[Budget]) -> list[tuple[int | None, Assertion]]:
         """Return the assertions, each with the index of the budget before its colon; None for all budgets."""
         from ..api.comparison import COLUMNS
-        from ..tables import assertions
 
         parsed: list[tuple[int | None, Assertion]] = []
         texts = [budget.text for budget in budgets]
@@ -232,9 +231,8 @@ class RenderOptions:
             name = name.strip()
             if colon and name not in texts:
                 raise click.UsageError(f"--assert {text!r}: {name} is not one of the budgets, {', '.join(texts)}")
-            with assert_errors():
-                assertion = dataclasses.replace(assertions.parse(rest, COLUMNS), text=text.strip())
-            parsed.append((texts.index(name) if colon else None, assertion))
+            (assertion,) = parse_asserts([rest], COLUMNS)
+            parsed.append((texts.index(name) if colon else None, dataclasses.replace(assertion, text=text.strip())))
         return parsed
 
 

@@ -20,7 +20,7 @@ from ..tables.columns import FORMS
 from ..viewers.viewer_settings import StreamingSettings
 from .command import COMMON, Command, flag, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
-from .option_groups import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, assert_errors, report_outcomes, table_output
+from .option_groups import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, parse_asserts, report_outcomes, table_output
 from .outputs import NamedPath, claim_stdout, keep_apart, name_outputs
 from .rules import check
 from .viewing_options import Cameras, CutOptions, Inputs, check_view, files_read, scenes_of
@@ -117,7 +117,6 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     besides = files_read(options.cameras, instances)
     keep_apart(ctx, besides)
     from ..simulation import results
-    from ..tables import assertions
 
     columns = [each for each in results.COLUMNS if each.name not in results.TIMING or not options.no_timing]
     table = table_output(
@@ -125,8 +124,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     )
     check(ctx, table=table.form or "none")
     outputs = results.FrameOutputs(table, options.indices_out, options.padded, options.plot, options.overwrite)
-    with assert_errors():
-        asserts = [assertions.parse(text, (*results.COLUMNS, *results.LOADING)) for text in options.asserts]
+    asserts = parse_asserts(options.asserts, (*results.COLUMNS, *results.LOADING))
     start = time.perf_counter()
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.view_jobs import traverse_files

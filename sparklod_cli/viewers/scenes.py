@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ..cameras.camera import Camera
 from ..cameras.framing import Balls, balls_of
 from ..codecs.formats import PRECISIONS, RAD
-from ..codecs.losses import after
 from ..codecs.reader import Reader
 from ..io.local_files import size_of_input
 from ..io.opening import opened
@@ -379,7 +378,7 @@ def read_scenes(
             if scene.tree is None:
                 scene = _drawable(str(name), scene, notes)
             size = bytes_of(scene.splats) if file is None else size_of_input(file) or 0
-            drawn = scene.splats if through is None else after(through, file or Path(UNNAMED), scene, threads)
+            drawn = _rounded(scene, through, file, threads)
             entry: LoadedScene = LoadedScene(file, size, scene, drawn, chunks, precision, threads)
         else:
             from .paging import PagedScene, Pages
@@ -412,7 +411,7 @@ def _loaded_runs(
     if not len(splats):
         raise InvalidSplatsError(f"{file or UNNAMED}: it has no splats")
     scene = Scene(splats, **facts_of(found))
-    drawn = splats if through is None else after(through, file or Path(UNNAMED), scene, threads)
+    drawn = _rounded(scene, through, file, threads)
     if isinstance(found, TileScene):
         from .cesium import LoadedTiles
 
@@ -458,3 +457,12 @@ def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:
     if dropped:
         notes.append(f"{name}: left out {describe(dropped)}")
     return replace(scene, splats=splats)
+
+
+def _rounded(scene: Scene, through: str | None, file: Path | None, threads: int) -> Splats:
+    """Return the splats of a scene as an encoding of `codecs.losses.after` rounds them; None rounds nothing."""
+    if through is None:
+        return scene.splats
+    from ..codecs.losses import after
+
+    return after(through, file or Path(UNNAMED), scene, threads)
