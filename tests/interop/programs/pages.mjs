@@ -55,6 +55,15 @@ const server = createServer((request, response) => {
 });
 await new Promise((done) => server.listen(0, '127.0.0.1', done));
 
+/** Whether all pixels of a PNG in base64 are the same; runs in the page. */
+async function hasOneColor(png) {
+  const bitmap = await createImageBitmap(await (await fetch(`data:image/png;base64,${png}`)).blob());
+  const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext('2d');
+  context.drawImage(bitmap, 0, 0);
+  const pixels = new Uint32Array(context.getImageData(0, 0, bitmap.width, bitmap.height).data.buffer);
+  return pixels.every((each) => each === pixels[0]);
+}
+
 const args = ['--no-sandbox', '--use-angle=swiftshader', '--enable-unsafe-swiftshader', '--ignore-gpu-blocklist'];
 const browser = await playwright.chromium.launch({ executablePath: chromium, args });
 let tab;
@@ -77,13 +86,12 @@ const actions = {
     return found;
   },
   async still({ out }) {
-    const empty = await tab.screenshot();
-    for (let before = empty; ; ) {
-      await tab.waitForTimeout(1000);
+    for (let before = null; ; ) {
       const now = await tab.screenshot({ path: out });
       if (failures.length) throw new Error('the page failed');
-      if (now.equals(before) && !now.equals(empty)) return {};
+      if (before?.equals(now) && !(await tab.evaluate(hasOneColor, now.toString('base64')))) return {};
       before = now;
+      await tab.waitForTimeout(1000);
     }
   },
   async requests() {
