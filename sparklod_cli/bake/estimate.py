@@ -10,7 +10,7 @@ import functools
 from ..lod.tree_settings import BUILDERS, bytes_of
 from ..system import machine
 from ..system.errors import OutOfMemoryError
-from ..system.units import format_size
+from ..system.units import format_size, megabytes
 from .settings import BakeSettings
 
 #: Default share of the available memory that a bake may take: other programs need some, and these figures are
@@ -104,6 +104,6 @@ def block_splats_within(
         if size < LEAST_BLOCK_SPLATS:
             raise OutOfMemoryError(
                 f"{format_size(memory)} of memory is too little even out of core; give --memory"
-                f" {format_size(ENOUGH * needed(LEAST_BLOCK_SPLATS))} or more"
+                f" {megabytes(ENOUGH * needed(LEAST_BLOCK_SPLATS))} or more"
             )
     return size

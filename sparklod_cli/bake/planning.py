@@ -23,7 +23,7 @@ from ..system.output import HAS_LOCKS, created, lock
 from ..system.progress import Progress
 from ..system.stdio import name_of
 from ..system.threads import ordered_map
-from ..system.units import count_of, format_size
+from ..system.units import count_of, format_size, megabytes
 from ..system.untrusted import parse_json
 from . import estimate
 from .identity import BakeIdentity
@@ -116,7 +116,7 @@ def _reason(
             raise OutOfMemoryError(
                 f"{whole}, not in blocks: {count_of(header.count, 'splat')} would take about"
                 f" {format_size(needed)} of memory, and {format_size(memory)} are enough for {most:,}; give --memory"
-                f" {format_size(estimate.ENOUGH * needed)} or more if the machine has it, or fewer splats"
+                f" {megabytes(estimate.ENOUGH * needed)} or more if the machine has it, or fewer splats"
             )
         allowed = "may take" if resources.memory is None else "--memory gives it"
         return f"it would take about {format_size(needed)} of memory and {allowed} {format_size(memory)}"

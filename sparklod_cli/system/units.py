@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 #: Prefixes in lower case, as either case is understood: m cannot sensibly mean a thousandth of a bit.
@@ -36,6 +37,11 @@ def format_size(size: float) -> str:
         if size >= least:
             return f"{size / power:,.1f} {name}"
     return f"{size / 1e3:.1f} kB"
+
+
+def megabytes(size: float) -> str:
+    """Return a number of bytes, rounded up, in the form that --memory takes: "224MB"."""
+    return f"{math.ceil(size / 1e6)}MB"
 
 
 def format_duration(seconds: float) -> str:

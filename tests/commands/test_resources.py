@@ -68,9 +68,9 @@ def test_the_default_memory_is_a_share_of_the_available_memory(cli: Cli, monkeyp
 
 def test_too_little_memory_is_an_error_that_says_how_much_is_enough(cli: Cli) -> None:
     err = cli("build-lod demo.ply -o a.spz --memory 20M", status=1).err
-    found = re.search(r"20.0 MB of memory is too little even out of core; give --memory (.*) or more", err)
+    found = re.search(r"20.0 MB of memory is too little even out of core; give --memory (\S*) or more", err)
     assert found is not None
-    cli(f"build-lod demo.ply -o a.spz --memory '{found[1]}'")
+    cli(f"build-lod demo.ply -o a.spz --memory {found[1]}")
     assert cli.made() == ["a.spz"]
 
 
@@ -86,9 +86,9 @@ def test_too_little_memory_is_an_error_that_says_how_much_is_enough(cli: Cli) ->
 def test_a_bake_of_a_whole_tree_names_the_memory_that_is_enough(options: str, why: str, cli: Cli) -> None:
     err = cli(f"build-lod demo.ply {options} --memory 3M", status=1).err
     assert f"demo.ply: {why}, not in blocks: " in err
-    found = re.search(r"3\.0 MB are enough for [1-9][\d,]+; give --memory (.*) or more if the machine has it", err)
+    found = re.search(r"3\.0 MB are enough for [1-9][\d,]+; give --memory (\S*) or more if the machine has it", err)
     assert found is not None
-    cli(f"build-lod demo.ply {options} --memory '{found[1]}'")
+    cli(f"build-lod demo.ply {options} --memory {found[1]}")
 
 
 def test_existing_scenes_are_skipped_if_their_inputs_did_not_change(cli: Cli) -> None:
