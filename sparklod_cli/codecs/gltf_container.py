@@ -28,8 +28,8 @@ from ..model.splats import FloatArray
 from ..model.transforms import LARGEST, Transform, scale_of
 from ..system.errors import FormatError, TruncatedError, UnsupportedError, VersionError
 from ..system.untrusted import Json, Origin, quoted_value
+from .format_rules import leads_away
 from .reader import OpenFile, size_of
-from .rules import leads_away
 
 #: The header of a binary file, magic, version and length, and of a chunk, length and type.
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")

@@ -18,8 +18,8 @@ from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..system.units import count_of
 from ..system.untrusted import quoted_value
+from .format_rules import RuleViolation, error_of
 from .reader import Fill, OpenCompanion, OpenFile, Reader, RowBuffer
-from .rules import RuleViolation, error_of
 
 
 @dataclass(frozen=True, eq=False)

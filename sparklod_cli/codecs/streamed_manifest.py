@@ -26,10 +26,10 @@ from ..system.progress import Progress, silent
 from ..system.units import count_of
 from ..system.untrusted import Json, quoted_value
 from . import quantize, sog, sog_images
+from .format_rules import RuleViolation, count_outside, leads_away, nodes_of, parse_manifest, place_of, violation
 from .formats import MANIFEST, ZIP
 from .merging import Chunk, SceneFiles, not_finite
 from .reader import FileNote, OpenCompanion, code_of, read_note
-from .rules import RuleViolation, count_outside, leads_away, nodes_of, parse_manifest, place_of, violation
 from .sog import MAX_META, image_names, parse_meta
 
 #: The version that is read and written. A manifest from before versions has none.

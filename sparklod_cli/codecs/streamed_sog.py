@@ -22,11 +22,11 @@ from ..system.units import count_of
 from ..system.untrusted import quoted_value
 from . import quantize, sog
 from .compression import check_promise
+from .format_rules import check_rules, error_of
 from .formats import ENVIRONMENT_FILE, MANIFEST, META, chunk_folder
 from .merging import Chunk
 from .options import WriteOptions
 from .reader import OpenCompanion, OpenFile, Reader, note_of, size_of
-from .rules import check_rules, error_of
 from .streamed_manifest import (
     MAX_MANIFEST,
     VERSION,

@@ -25,12 +25,7 @@ from ..system.errors import FormatError, UnsupportedError, VersionError
 from ..system.progress import Progress, silent
 from ..system.units import count_of
 from ..system.untrusted import Json, quoted_value
-from .formats import TILESET
-from .gltf_attributes import COMPRESSION, EXTENSION
-from .gltf_container import product, rotation_of_up
-from .merging import Chunk, SceneFiles, not_finite
-from .reader import FileNote, OpenCompanion, read_note
-from .rules import (
+from .format_rules import (
     LOOSE_BOUND,
     RuleViolation,
     count_outside,
@@ -41,6 +36,11 @@ from .rules import (
     place_of,
     violation,
 )
+from .formats import TILESET
+from .gltf_attributes import COMPRESSION, EXTENSION
+from .gltf_container import product, rotation_of_up
+from .merging import Chunk, SceneFiles, not_finite
+from .reader import FileNote, OpenCompanion, read_note
 
 #: The version that is written, and the one before it, which is read, too.
 VERSION, OLD_VERSION = "1.1", "1.0"

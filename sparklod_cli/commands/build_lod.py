@@ -434,7 +434,8 @@ def _check(ctx: click.Context, options: BuildLodOptions, target: Target) -> list
 def _check_format(options: BuildLodOptions, target: Target) -> None:
     """Raise a `click.UsageError` where the format is not clear, or holds no tree."""
     suffixes = {source.suffix.lower() for source in options.inputs}
-    if options.refine is not None and options.form is None and options.output is None and RAD in suffixes != {RAD}:
+    keeps_format = options.refine is not None and options.form is None and options.output is None
+    if keeps_format and RAD in suffixes and len(suffixes) > 1:
         raise click.UsageError(
             "--refine keeps the format of a Level-of-Detail file, and the inputs are of several; give --format, or"
             " refine the .rad files on their own"

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from ..codecs import streamed_manifest, tileset
+from ..codecs.format_rules import RuleViolation
 from ..codecs.rad import rad_header
-from ..codecs.rules import RuleViolation
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 

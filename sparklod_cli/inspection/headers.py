@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..codecs import tileset as tilesets
+from ..codecs.format_rules import RuleViolation
 from ..codecs.merging import Chunk
 from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16
 from ..codecs.rad.rad_header import RadChunkHeader, RadHeader, encoding_fields
 from ..codecs.rad.rad_reader import scan_chunks, scan_header
 from ..codecs.reader import OpenCompanion, size_of
-from ..codecs.rules import RuleViolation
 from ..codecs.spark_codings import log_scale_table
 from ..codecs.streamed_manifest import VERSION as STREAMED_SOG_VERSION
 from ..codecs.streamed_manifest import scan_files, scan_splats

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+from ..codecs.format_rules import check_rules
 from ..codecs.rad.rad_header import RadHeader, header_violations, read_header
 from ..codecs.rad.rad_reader import RadChunk, RadReader, decoded_bytes, file_of, read_chunk
-from ..codecs.rules import check_rules
 from ..model.splats import FloatArray
 from ..system.errors import UnreadableError
 from ..system.machine import available_memory

@@ -9,7 +9,11 @@ from types import SimpleNamespace
 #: Compute capability: the oldest that CUDA 12 and 13 both compile for.
 CAPABILITY = (7, 5)
 
-MODULES = ("sparklod_cli.render.cuda.forward", "sparklod_cli.render.cuda.backward", "sparklod_cli.fitting.cuda.kernels")
+MODULES = (
+    "sparklod_cli.render.cuda.forward",
+    "sparklod_cli.render.cuda.card_gradients",
+    "sparklod_cli.fitting.cuda.kernels",
+)
 
 #: Exit status where NVVM is missing.
 MISSING = 77

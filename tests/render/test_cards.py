@@ -109,8 +109,8 @@ MOST = 1e-3
 
 
 def test_gradients_are_those_of_the_processor() -> None:
-    from sparklod_cli.render.cuda.backward import BATCH, gradients_on_card
     from sparklod_cli.render.cuda.card import to_card
+    from sparklod_cli.render.cuda.card_gradients import BATCH, gradients_on_card
     from sparklod_cli.render.cuda.card_rasterizer import CardSplats, CardView, draw_on_card
 
     splats, camera, settings = splats_of(40), camera_at(size=(18, 10)), RasterSettings(max_radius=25.0)

@@ -21,10 +21,10 @@ from ...model import MAX_SH_DEGREE
 from ...model.lod_tree import CHUNK_NODES
 from ...system.errors import FormatError, NotSplatsError, PromiseError, TruncatedError, VersionError
 from ...system.untrusted import Json, Origin, quoted_value
+from ..format_rules import RuleViolation, violation
 from ..formats import RAD_SUFFIX, rad_chunk_name
 from ..quantize import LARGEST
 from ..reader import FileNote, read_comment
-from ..rules import RuleViolation, violation
 from ..spark_codings import SplatEncoding
 from .property_codings import BY_NAME, CODINGS, GZ, PROPERTIES, Property, Row
 

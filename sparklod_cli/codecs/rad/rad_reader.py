@@ -22,9 +22,9 @@ from ...system.progress import Progress
 from ...system.threads import ordered_map
 from .. import compression, spark_codings
 from ..compression import INFLATE_ERRORS, raw_unpacker
+from ..format_rules import RuleViolation, check_rules, error_of
 from ..quantize import Bytes, quat_of_xyz
 from ..reader import OpenCompanion, OpenFile, Reader, RowBuffer, size_of
-from ..rules import RuleViolation, check_rules, error_of
 from .property_codings import BY_NAME, CODINGS, Property, Row, encodings_of
 from .rad_header import (
     Files,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...render.cuda.backward import gradients_on_card
 from ...render.cuda.card import CardArray, card_errors, on_card, to_card
+from ...render.cuda.card_gradients import gradients_on_card
 from ...render.cuda.card_rasterizer import CardPicture, CardSplats, CardView, draw_on_card
 from ..kernels import adam
 from ..pictures import LEAST_ERROR, FittedNodes, FullDetailPicture, Index, Optimiser, slots_of
