@@ -202,7 +202,7 @@ def test_an_unreadable_instances_file_is_named(tmp_path: Path, monkeypatch: pyte
         assert str(caught.value).startswith(str(path))
     with pytest.raises(SparklodError, match="it is a pipe or a device"):
         read_instances(Path("/dev/zero"))
-    monkeypatch.setattr("sparklod_cli.io.local_files.MAX_TEXT", 100)
+    monkeypatch.setattr("sparklod_cli.io.files.MAX_TEXT", 100)
     (tmp_path / "large.json").write_bytes(b" " * 101)
     with pytest.raises(SparklodError, match=r"large\.json is larger than"):
         read_instances(tmp_path / "large.json")

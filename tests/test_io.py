@@ -13,8 +13,8 @@ from sparklod_cli.bake.identity import files_of
 from sparklod_cli.cli import run
 from sparklod_cli.codecs.formats import FORMATS
 from sparklod_cli.codecs.rad.rad_header import RadChunkEntry, RadHeader, pack_header
-from sparklod_cli.io import local_files
-from sparklod_cli.io.local_files import companions, leads_away
+from sparklod_cli.io import files
+from sparklod_cli.io.files import companions, leads_away
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.system.errors import FormatError, UnreadableError
 from tests.conftest import FIXTURES, IS_ROOT, Capture
@@ -85,16 +85,16 @@ def test_a_scene_outlives_its_file(tmp_path: Path) -> None:
 def test_texts_must_be_regular_files_below_a_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text, pipe = tmp_path / "a.json", tmp_path / "pipe"
     text.write_bytes(b"\xef\xbb\xbf{}")
-    assert local_files.read_text(text) == "{}"
+    assert files.read_text(text) == "{}"
     os.mkfifo(pipe)
     for path in (pipe, tmp_path, Path("/dev/zero"), Path("/dev/null"), tmp_path / "missing"):
         with pytest.raises(UnreadableError, match=re.escape(f"{path} cannot be read: ")):
-            local_files.read_text(path)
-    monkeypatch.setattr(local_files, "MAX_TEXT", 5)
-    assert local_files.read_text(text) == "{}"
+            files.read_text(path)
+    monkeypatch.setattr(files, "MAX_TEXT", 5)
+    assert files.read_text(text) == "{}"
     text.write_bytes(b"123456")
     with pytest.raises(UnreadableError, match="is larger than"):
-        local_files.read_text(text)
+        files.read_text(text)
 
 
 @pytest.mark.parametrize("option", ["--scene", "--camera-path", "--world-transform"])

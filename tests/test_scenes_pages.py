@@ -58,7 +58,7 @@ def file(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def little_memory(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As if files did not fit into memory."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("io.rad_file", "viewers.paging"):
+        for module in ("codecs.rad.rad_reader", "viewers.paging"):
             patch.setattr(f"sparklod_cli.{module}.available_memory", lambda: 1 << 20)
         yield
 
@@ -177,7 +177,7 @@ def test_commands_write_the_same_files(arguments: list[str], file: Path, tmp_pat
         given = [argument.format(tmp_path / name / "a") for argument in arguments]
         with pytest.MonkeyPatch.context() as patch:
             if name == "whole":
-                patch.setattr("sparklod_cli.io.rad_file.available_memory", lambda: None)
+                patch.setattr("sparklod_cli.codecs.rad.rad_reader.available_memory", lambda: None)
             assert run([given[0], str(file), *given[1:], "-q"]) == 0
         files = sorted(each for each in (tmp_path / name).rglob("*") if each.is_file())
         written.append({str(each.relative_to(tmp_path / name)): each.read_bytes() for each in files})

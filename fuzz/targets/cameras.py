@@ -14,7 +14,7 @@ from fixtures import camera_files
 from sparklod_cli.cameras.camera import Settings
 from sparklod_cli.cameras.camera_files import LARGEST, Files, read
 from sparklod_cli.cameras.camera_formats import FORMATS, NAMES
-from sparklod_cli.io.local_files import read_together
+from sparklod_cli.io.files import read_together
 
 from ..case import Case, LawError, Rng
 from ..command import command

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli.io.local_files import read_rgba
+from sparklod_cli.io.files import read_rgba
 
 from ..case import Case, LawError, Rng
 from ..command import command

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Collection, Mapping
+import functools
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -15,14 +17,21 @@ from ..codecs.formats import DEFAULT_COMPRESSION, MANIFEST, NPZ, RAW_SUFFIXES, W
 from ..codecs.options import RadOptions, SogOptions, WriteOptions
 from ..codecs.reader import check_valid
 from ..codecs.spark_codings import SplatEncoding
-from ..io import rad_file
+from ..io.files import open_named, readable
 from ..io.reading import read_scene
 from ..io.writing import parts_output, scene_output, write_scene
 from ..lod.tree_settings import DetailSettings
 from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, FloatArray
-from ..system.errors import FormatError, InvalidSplatsError, TreeError, memory_errors_translated, naming
+from ..system.errors import (
+    FormatError,
+    InvalidSplatsError,
+    TreeError,
+    UnreadableError,
+    memory_errors_translated,
+    naming,
+)
 from ..system.output import Output
 from ..system.progress import Progress
 from ..system.threads import thread_count
@@ -157,9 +166,8 @@ def read_rad_header(path: Path | str) -> RadHeader:
     Raises:
         FormatError: it cannot be read, is not a RAD header, or contradicts itself.
     """
-    path = Path(path)
-    with naming(path, OF_FILES):
-        return rad_file.read_rad_header(path)
+    with _opened_rad(Path(path)) as (_, header):
+        return header
 
 
 def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None = None) -> RadChunk:
@@ -176,11 +184,32 @@ def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None 
         TypeError: the number is not a whole one.
         ValueError: there is no such chunk, or the palette is of another SH degree than the file.
     """
+    from ..codecs.rad.rad_reader import file_of, read_chunk
+
     path = Path(path)
     if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
         raise TypeError(f"number is {number!r}; give a whole number, which counts chunks from 0")
-    with naming(path, OF_FILES), memory_errors_translated():
-        return rad_file.read_rad_chunk(path, number, palette=palette)
+    with memory_errors_translated(), _opened_rad(path) as (file, header):
+        if not 0 <= number < len(header.chunks):
+            raise ValueError(f"number is {number}; its chunks are 0 to {len(header.chunks) - 1}")
+        entry = header.chunks[number]
+        with file_of(entry, file, functools.partial(open_named, path)) as source:
+            return read_chunk(source, entry, header, palette)
+
+
+@contextlib.contextmanager
+def _opened_rad(path: Path) -> Iterator[tuple[BinaryIO, RadHeader]]:
+    """Open a RAD file and read its header; a `FormatError` names the file."""
+    from ..codecs.format_rules import check_rules
+    from ..codecs.rad.rad_header import header_violations, read_header
+
+    with naming(path, OF_FILES), readable():
+        if path.exists() and not path.is_file():
+            raise UnreadableError("cannot be read: it is a directory, a pipe or a device")
+        with path.open("rb") as file:
+            header = read_header(file)
+            check_rules(header_violations(header))
+            yield file, header
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,8 @@ import numpy as np
 
 from .. import __version__
 from ..cameras.camera_formats import NAMES
-from ..io.local_files import companions
-from ..io.opening import file_of, readable
-from ..io.reading import Source, placement_of, places_of
+from ..io.files import companions, file_of, readable
+from ..io.reading import Merged, Source, places_of
 from ..model.transforms import Transform
 from ..system.addresses import Address, Place
 from ..system.errors import UnreadableError
@@ -116,7 +115,10 @@ class BakeIdentity:
             states.append(state)
         settings = dataclasses.replace(settings, transform=settings.transform or Transform())
         values = {name: value for name, value in _flat("", settings) if name not in NO_PART}
-        return cls(tuple(states), {PROGRAM: __version__, **values, **placement_of(source)})
+        if isinstance(source, Merged):  # the rotation of each file row by row, its scale, its translation
+            numbers = ((*each.rotation.flat, each.scale, *each.translation) for _, each in source.files)
+            values["merged"] = [[*map(float, each)] for each in numbers]
+        return cls(tuple(states), {PROGRAM: __version__, **values})
 
     @classmethod
     def from_record(cls, record: Any) -> BakeIdentity:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..codecs.reader import check_valid, is_valid_and_visible
 from ..codecs.statistics import Statistics
-from ..io.local_files import read_rgba
+from ..io.files import read_rgba
 from ..io.reading import Source, read_scene
 from ..lod.tree_settings import BUILDERS
 from ..model.lod_tree import LodTree

@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..io.opening import readable
+from ..io.files import readable
 from ..io.reading import Source
 from ..system.addresses import Address, Place, size_of
 from ..system.errors import OutputError, UnreadableError, reason_of

@@ -13,8 +13,8 @@ from ..codecs.encoder import CLAMPED, results, windows_of
 from ..codecs.formats import RAD_SUFFIX as RAD
 from ..codecs.formats import WRITABLE, Format
 from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
-from ..io.opening import opened
-from ..io.reading import Merged, Source, read_stored
+from ..io.files import opened
+from ..io.reading import Merged, Source
 from ..io.writing import parts_output, scene_output
 from ..model.scene import Scene
 from ..model.splats import Splats, same_rows
@@ -115,7 +115,8 @@ def keep_tree(tree: BuiltTree, source: Source, scene: Scene) -> None:
     is_plain = dataclasses.replace(options, rad=dataclasses.replace(options.rad, chunked=False)) == DEFAULTS
     if is_same and (settings.refine is not None or not is_plain or not tree.in_chunks):
         assert not isinstance(source, Merged)  # of which no part is a tree
-        tree.stored, tree.options = read_stored(source, options)
+        with opened(source) as (file, form):
+            tree.stored, tree.options = form.codec().stored(file, options)
         tree.before, tree.is_ordered = scene.splats, True
     elif is_same:
         assert not isinstance(source, Merged)

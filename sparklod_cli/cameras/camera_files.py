@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..io.local_files import read_text, read_together
+from ..io.files import read_text, read_together
 from ..system import untrusted
 from ..system.errors import CameraPathError, SparklodError
 from ..system.untrusted import LARGEST as LARGEST_NUMBER

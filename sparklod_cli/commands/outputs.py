@@ -237,7 +237,7 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
     # An output that does not exist is no companion of an input, which would have to be opened to find that out.
     if any(status is not None for _, status in written):
         from ..cameras.camera_formats import NAMES
-        from ..io.local_files import companions
+        from ..io.files import companions
 
         read += [each for path in read if isinstance(path, Path) for each in companions(path, NAMES)]
     for path in read:

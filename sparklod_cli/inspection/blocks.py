@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.rad.rad_reader import RadReader
-from ..io.rad_file import reopened
+from ..io.files import reopened
 from ..lod.kernels.tree_links import find_depths, find_parents
 from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_NODES, LodTree

@@ -15,13 +15,11 @@ import numpy as np
 from ..codecs import data_texture, ext_splats, packed_splats, spark_nodes
 from ..codecs.array_files import Arrays
 from ..codecs.formats import RAD
-from ..codecs.rad.rad_reader import RadReader
+from ..codecs.rad.rad_reader import RadReader, fits
 from ..codecs.reader import code_of
 from ..codecs.spark_codings import SplatEncoding
 from ..codecs.spz import KNOWN_FLAGS
-from ..io.local_files import read_text, size_of_input
-from ..io.opening import opened, read_arrays
-from ..io.rad_file import fits
+from ..io.files import opened, read_arrays, read_text, size_of_input
 from ..io.reading import read_scene
 from ..model.scene import Scene
 from ..model.sh import width_of
@@ -62,7 +60,7 @@ class ReportSettings:
         all_quantities: all of their quantities, instead of the main ones.
         headers_only: read no more than headers where a format has those; tree and values are left out.
         at_once: have the whole scene in memory, with all columns, for callers that draw it; False reads RAD files chunk
-            by chunk; None does so with large ones, see `io.rad_file.fits`.
+            by chunk; None does so with large ones, see `rad_reader.fits`.
     """
 
     chunks: bool = False

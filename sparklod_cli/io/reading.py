@@ -23,10 +23,9 @@ from ..system.output import write_atomically
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH, name_of
 from ..system.units import count_of
-from .opening import open_splats, opened, readable
+from .files import open_splats, opened, readable
 
 if TYPE_CHECKING:
-    from ..codecs.options import WriteOptions
     from ..model.scene import DetailScene, TileScene
     from ..model.transforms import Transform
 
@@ -39,13 +38,13 @@ _LOCK = threading.Lock()
 
 @dataclass(frozen=True, eq=False)
 class Merged:
-    """Several files without trees that are one scene, and the transform of each; a file may be named more than once."""
+    """Several files without trees that are one scene, each with its transform; a file may occur more than once."""
 
     files: tuple[tuple[Place, Transform], ...]
 
     @classmethod
     def of(cls, places: Sequence[Place]) -> Merged:
-        """Return files where their own coordinates put them."""
+        """Merge files where their own coordinates put them."""
         from ..model.transforms import Transform
 
         return cls(tuple((place, Transform()) for place in places))
@@ -64,19 +63,10 @@ def places_of(source: Source) -> list[Place]:
 
 
 def absolute_source(source: Source) -> Source:
-    """Return the same source for processes whose working folders are others."""
+    """Return the source with absolute paths, for processes with other working folders."""
     if not isinstance(source, Merged):
         return absolute(source)
     return Merged(tuple((absolute(file), transform) for file, transform in source.files))
-
-
-def placement_of(source: Source) -> dict[str, Any]:
-    """Return where the files of a source stand, as a recipe has it; nothing for a single file."""
-    if not isinstance(source, Merged):
-        return {}
-    # The rotation row by row, the scale, the translation.
-    numbers = ((*each.rotation.flat, each.scale, *each.translation) for _, each in source.files)
-    return {"merged": [[*map(float, each)] for each in numbers]}
 
 
 def read_scene(
@@ -101,19 +91,8 @@ def read_scene(
         return reader.scene(columns=columns, progress=progress, validate=validate)
 
 
-def read_stored(path: Place, options: WriteOptions) -> tuple[Any, WriteOptions]:
-    """Read the codes of a file whose format can hold a tree, so that its leaves can be written again bit for bit.
-
-    Returns:
-        the codes, for `Encoder.keeping`, and the options, which have the file's value where they leave a choice open.
-    """
-    with opened(path) as (source, form):
-        found: tuple[Any, WriteOptions] = form.codec().stored(source, options)
-    return found
-
-
 def read_parts(path: Place, *, threads: int = 1, progress: Progress = silent) -> DetailScene | TileScene | None:
-    """Read a scene with all its detail levels or tiles; None if its format has neither. Raises as `read_scene`."""
+    """Read a scene with all its detail levels or tiles; return None if its format has neither."""
     with opened(path) as (source, form):
         if form.parts is None:
             return None
@@ -125,19 +104,18 @@ def read_parts(path: Place, *, threads: int = 1, progress: Progress = silent) ->
 
 @contextlib.contextmanager
 def open_reader(source: Source, *, scratch: Path | None = None, threads: int = 1) -> Iterator[Reader]:
-    """Open a file of any known format, or several as one scene, see `merging.merged`.
+    """Open a file of any known format, or several as one scene (see `merging.merged`), and read only the header.
 
-    Only its header is read now. Any range of splats can be read until the end, on several threads. Columns that lie one
-    after the other (SPZ, SOG), and text, are unpacked once, when a block is first read; see docs/formats.md for the
-    size of the unpacked file.
+    Several threads may read any range of splats until the context ends. Columns that lie one after the other (SPZ, SOG)
+    and text are unpacked to a file when a block is first read; see docs/formats.md for its size.
 
     Args:
-        scratch: folder for the unpacked file, which stays there, so that other processes find it; the owner of the
-            folder removes it. The reader can be pickled then. None for one of the system's temporary files.
+        scratch: folder for the unpacked file, which stays there for other processes, so that the reader can be pickled;
+            the owner of the folder removes it. None for a temporary file of the system.
 
     Raises:
-        FormatError: as `io.read_scene`. Reading raises errors behind the header, and `OutputError` if there is no room
-            for the unpacked file. Of several files, errors name the file.
+        FormatError: as `read_scene`; reading may raise further ones, and an `OutputError` without room for the unpacked
+            file. With several files, errors name the file.
         HasTreeError: one of several files has a tree.
     """
     with contextlib.ExitStack() as closing:
@@ -152,7 +130,7 @@ def open_reader(source: Source, *, scratch: Path | None = None, threads: int = 1
 
 
 def _version(path: Place, scratch: Path | None) -> tuple[Any, ...]:
-    """Return size and time of a file, or the version of an address; () if that takes a request without need."""
+    """Return size and date of a file, or the version at an address; () where nothing compares it."""
     if path == DASH or (isinstance(path, Address) and scratch is None):
         return ()
     if isinstance(path, Address):
@@ -164,7 +142,7 @@ def _version(path: Place, scratch: Path | None) -> tuple[Any, ...]:
 def _opened(
     path: Place, version: tuple[Any, ...], folder: Path | None, threads: int, closing: contextlib.ExitStack
 ) -> Reader:
-    """Open a file, and later its unpacked rows, until `closing` closes them."""
+    """Open a file, and when it is first needed its unpacked file, until `closing` closes them."""
     lock, unpacked = threading.Lock(), list[OpenFile]()
 
     def scratch(pieces: Callable[[], Iterable[bytes]]) -> OpenFile:
@@ -172,11 +150,15 @@ def _opened(
             if not unpacked:
                 try:
                     if folder is None:
-                        file = _temporary(pieces)
+                        file = _temporary(_readable(pieces))
                     else:
                         parts = (path.url if isinstance(path, Address) else path.absolute(), *version)
                         text = "\n".join(map(str, parts)).encode("utf-8", "surrogateescape")
-                        file = _kept(folder / f"{hashlib.sha256(text).hexdigest()[:32]}.unpacked", pieces)
+                        target = folder / f"{hashlib.sha256(text).hexdigest()[:32]}.unpacked"
+                        if not target.exists():
+                            folder.mkdir(parents=True, exist_ok=True)
+                            write_atomically(target, _readable(pieces), overwrite=True)
+                        file = target.open("rb")
                 except OSError as error:
                     where = folder or tempfile.gettempdir()
                     raise OutputError(f"cannot write to the scratch folder {where}: {reason_of(error)}") from None
@@ -188,12 +170,11 @@ def _opened(
     return dataclasses.replace(reader, threads=threads)
 
 
-def _temporary(pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
-    """Write a file without a name, which the system removes."""
+def _temporary(pieces: Iterable[bytes]) -> BinaryIO:
+    """Write a file without a name, which the system removes when it is closed."""
     file: BinaryIO = tempfile.TemporaryFile(prefix="sparklod-")  # noqa: SIM115
     try:
-        for piece in _readable(pieces):
-            file.write(piece)
+        file.writelines(pieces)
         file.flush()
     except BaseException:
         file.close()
@@ -201,22 +182,15 @@ def _temporary(pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
     return file
 
 
-def _kept(target: Path, pieces: Callable[[], Iterable[bytes]]) -> BinaryIO:
-    """Write a file unless it exists; it appears whole or not at all."""
-    if not target.exists():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(target, _readable(pieces), overwrite=True)
-    return target.open("rb")
-
-
 def _readable(pieces: Callable[[], Iterable[bytes]]) -> Iterator[bytes]:
+    """Yield pieces that are made from an input, so that its `OSError` is not taken for one of the unpacked file."""
     with readable():
         yield from pieces()
 
 
 @dataclass(frozen=True, eq=False)
 class _FillFromFile:
-    """`Reader.fill` of a file, which is opened again in another process, after it was closed, and if it changed."""
+    """`Reader.fill` that opens its file again in another process, after the file was closed, or if it was changed."""
 
     path: Place
     version: tuple[Any, ...]
@@ -244,18 +218,19 @@ class _FillFromFile:
 
 @functools.lru_cache(MOST)
 def _opened_again(path: Place, version: tuple[Any, ...], scratch: Path | None, threads: int) -> Reader:
-    """Open a file; it is closed when it is not read and `MOST` others have been opened since."""
-    closing = contextlib.ExitStack()
-    with contextlib.ExitStack() as after_an_error:
-        after_an_error.enter_context(closing)
+    """Open a file that stays open until `MOST` others have been opened since and its reader is no longer used."""
+    closing = contextlib.ExitStack()  # to which the unpacked file is added later
+    try:
         reader = _opened(path, version, scratch, threads, closing)
-        after_an_error.pop_all()
+    except BaseException:
+        closing.close()
+        raise
     weakref.finalize(reader, closing.close)
     return reader
 
 
 def _merged(source: Merged, scratch: Path | None, threads: int, closing: contextlib.ExitStack) -> Reader:
-    """Open several files; the header of a file that is named twice is read once."""
+    """Open several files; a file that occurs more than once is opened once."""
     from ..codecs.merging import Placed, merged  # what a single file does without
 
     closing.callback(_opened_again.cache_clear)

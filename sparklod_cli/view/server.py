@@ -20,7 +20,7 @@ from typing import Any, BinaryIO
 from urllib.parse import unquote_to_bytes
 
 from .. import __version__
-from ..io.local_files import open_plain
+from ..io.files import open_plain
 from ..system.errors import SparklodError
 from .shown_files import media_type
 from .site import CAMERAS, INDEX, MAX_BYTES, Site, parse_drop

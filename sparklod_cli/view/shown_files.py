@@ -33,8 +33,7 @@ from ..codecs.streamed_manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..codecs.tiles_3d import names_of
 from ..codecs.tileset import MAX_TILESET
 from ..codecs.zip_folder import ZipFolder
-from ..io.local_files import check_companion, in_folder, open_named, open_plain, reason_unreadable
-from ..io.opening import unknown_format
+from ..io.files import check_companion, in_folder, open_named, open_plain, reason_unreadable, unknown_format
 from ..io.reading import read_parts, read_scene
 from ..model.lod_tree import CHUNK_NODES
 from ..model.scene import DetailScene, TileScene

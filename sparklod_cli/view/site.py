@@ -26,7 +26,7 @@ from ..cameras.camera import Settings as CameraSettings
 from ..cameras.camera_files import Files, read
 from ..cameras.camera_formats import NAMES
 from ..cameras.sources import CameraPath
-from ..io.local_files import leads_away, open_plain, read_text
+from ..io.files import leads_away, open_plain, read_text
 from ..model.scene import up_notes_of
 from ..system.errors import CameraPathError, OutputError, SparklodError, reason_of
 from ..system.output import try_place, write_file

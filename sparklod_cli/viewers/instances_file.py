@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..cameras.camera import rotation_of
-from ..io.local_files import is_file_name, read_text
+from ..io.files import is_file_name, read_text
 from ..model import TOTAL
 from ..model.foveation import Cones, Foveation, Frustum
 from ..model.instances import Instance, Matrix, names_of

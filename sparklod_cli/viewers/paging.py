@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..cameras.framing import SAMPLE, USED, Balls, balls_of
 from ..codecs.rad.rad_reader import RadReader
-from ..io.rad_file import reopened
+from ..io.files import reopened
 from ..lod.kernels.pixel_scale import NODE
 from ..model.instances import Instance
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree, Nodes

@@ -18,8 +18,7 @@ from ..cameras.camera import Camera
 from ..cameras.framing import Balls, balls_of
 from ..codecs.formats import PRECISIONS, RAD
 from ..codecs.reader import Reader
-from ..io.local_files import size_of_input
-from ..io.opening import opened
+from ..io.files import opened, size_of_input
 from ..lod.budget import Budget
 from ..model.gaussian import placed
 from ..model.instances import Instance, Matrix
@@ -433,8 +432,7 @@ def _read(
     """
     with naming(path), memory_errors_translated(), opened(path, threads) as (source, form):
         if paged is not None and form.name == RAD and path != DASH:
-            from ..codecs.rad.rad_reader import RadReader
-            from ..io.rad_file import fits
+            from ..codecs.rad.rad_reader import RadReader, fits
             from .paging import Pages
 
             with contextlib.suppress(FormatError):  # which is raised below

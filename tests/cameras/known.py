@@ -14,7 +14,7 @@ from sparklod_cli.cameras.camera import Camera, Settings
 from sparklod_cli.cameras.camera_files import Files, read
 from sparklod_cli.cameras.camera_formats import NAMES
 from sparklod_cli.cameras.sources import CameraPath
-from sparklod_cli.io.local_files import read_together
+from sparklod_cli.io.files import read_together
 from tests.conftest import FIXTURES
 
 FOLDER = FIXTURES / "cameras"

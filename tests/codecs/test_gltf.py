@@ -22,7 +22,7 @@ from sparklod_cli.codecs.gltf_container import TURNS
 from sparklod_cli.codecs.options import PROFILES, WriteOptions
 from sparklod_cli.codecs.reader import OpenFile
 from sparklod_cli.inspection.report import ReportSettings, inspect
-from sparklod_cli.io.local_files import companions
+from sparklod_cli.io.files import companions
 from sparklod_cli.io.reading import open_reader, read_scene
 from sparklod_cli.model.scene import AXES, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats

@@ -24,7 +24,7 @@ from sparklod_cli.commands.build_lod import CLAMPED_BY_SPZ
 from sparklod_cli.commands.console import Console, count_of, say_error
 from sparklod_cli.images.pyvista_scene import load_pyvista
 from sparklod_cli.inspection import tree
-from sparklod_cli.io import opening, reading
+from sparklod_cli.io import files, reading
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree
@@ -255,7 +255,7 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> Break:
         def fail(*args: object, **kwargs: object) -> None:
             raise error
 
-        for module in (opening, reading):
+        for module in (files, reading):
             monkeypatch.setattr(module, "open_splats", fail)
 
     return end_in

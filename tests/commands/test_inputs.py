@@ -22,7 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fixtures import by_hand
-from sparklod_cli.io.local_files import read_rgba
+from sparklod_cli.io.files import read_rgba
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod.tree_settings import METHODS
 from sparklod_cli.model.splats import COLUMNS

@@ -11,7 +11,7 @@ from sparklod_cli.cameras import camera
 from sparklod_cli.cameras.camera_formats import PLAYCANVAS
 from sparklod_cli.codecs import compression
 from sparklod_cli.inspection import tree
-from sparklod_cli.io import local_files
+from sparklod_cli.io import files
 from sparklod_cli.system import untrusted
 from tests.conftest import ROOT
 
@@ -68,7 +68,7 @@ def test_the_figures_of_security_are_those_of_the_code() -> None:
     for figure in (
         f"promises more than {compression.TRUSTED_SIZE >> 20} MiB",
         f"at most {compression.MAX_RATIO} times the size of the file",
-        f"read up to {local_files.MAX_TEXT >> 20} MiB and {untrusted.MAX_DEPTH} levels deep",
+        f"read up to {files.MAX_TEXT >> 20} MiB and {untrusted.MAX_DEPTH} levels deep",
         f"shorten texts to {untrusted.MOST} characters",
     ):
         assert figure in text

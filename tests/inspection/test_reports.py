@@ -476,7 +476,7 @@ def test_large_files_are_read_by_chunk_and_others_at_once(tmp_path: Path, monkey
     path = tree(240, chunk=24).write(tmp_path / "a.rad")
     _, scene = inspect(path, EVERYTHING)
     assert scene is not None
-    monkeypatch.setattr("sparklod_cli.io.rad_file.available_memory", lambda: 40_000)
+    monkeypatch.setattr("sparklod_cli.codecs.rad.rad_reader.available_memory", lambda: 40_000)
     report, scene = inspect(path, EVERYTHING)
     assert scene is None
     assert report.splats == 240

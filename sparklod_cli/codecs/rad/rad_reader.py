@@ -18,6 +18,7 @@ from ...model.scene import PLAIN_SCALES, FileCoding, ScaleCoding, Scene
 from ...model.sh import COEFFICIENTS, width_of
 from ...model.splats import COLUMNS, FloatArray, Splats
 from ...system.errors import FormatError, TooLongError, TruncatedError
+from ...system.machine import available_memory
 from ...system.progress import Progress
 from ...system.threads import ordered_map
 from .. import compression, spark_codings
@@ -323,6 +324,17 @@ def scan_chunks(
 def decoded_bytes(header: RadHeader) -> int:
     """Return the bytes of all columns of splats in memory."""
     return header.count * 4 * width_of(header.max_sh)
+
+
+#: Files whose decoded columns take more bytes than this, or than this share of the free memory, are read chunk by
+#: chunk: computed values take as much again, and chunk by chunk is no slower (docs/decisions/14-cuts.md).
+AT_ONCE, SHARE = 1 << 28, 0.25
+
+
+def fits(header: RadHeader) -> bool:
+    """Return whether a file is small enough to be read at once."""
+    free = available_memory()
+    return decoded_bytes(header) <= (AT_ONCE if free is None else min(AT_ONCE, SHARE * free))
 
 
 def _new_rows(count: int, header: RadHeader) -> tuple[Splats, LodTree | None]:
