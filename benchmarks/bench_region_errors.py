@@ -22,7 +22,7 @@ from sparklod_cli.lod import quality
 from sparklod_cli.lod.parts import detail_cuts, make_levels, owners_of
 from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.gaussian import covariance
-from sparklod_cli.model.scene import DetailScene
+from sparklod_cli.model.instances import DetailScene
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.rasterizer import shade
 from sparklod_cli.render.render_settings import RasterSettings

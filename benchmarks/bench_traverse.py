@@ -24,7 +24,7 @@ import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import look_at
 from sparklod_cli.cameras.framing import framing
 from sparklod_cli.codecs import spark_nodes
-from sparklod_cli.model.lod_tree import Nodes
+from sparklod_cli.codecs.spark_nodes import Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.simulation.frames import Changes, measure

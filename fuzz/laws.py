@@ -13,7 +13,8 @@ from PIL import Image
 from sparklod_cli.commands.inspect import finding_line
 from sparklod_cli.inspection import report
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
-from sparklod_cli.model.scene import DetailScene, Scene
+from sparklod_cli.model.instances import DetailScene
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.errors import FormatError, HasTreeError, InvalidSplatsError

@@ -17,7 +17,8 @@ from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import parts, quality
 from sparklod_cli.lod.tree_settings import TileSettings
-from sparklod_cli.model.scene import DetailScene, Scene
+from sparklod_cli.model.instances import DetailScene
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import linear

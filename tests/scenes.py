@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from fixtures import by_hand
+from sparklod_cli.codecs.reader import Reader, RowBuffer
 from sparklod_cli.model.gaussian import normalized_quat
-from sparklod_cli.model.lod_tree import LodTree, NodeStream
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS, SH_C0
-from sparklod_cli.model.splats import Splats
+from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.output import Files, Output
+from sparklod_cli.system.progress import Progress
 
 
 def random_splats(count: int, *, sh_degree: int = 0, seed: int = 0, extent: float = 1.0) -> Splats:
@@ -53,17 +54,19 @@ def splat_columns(count: int, *, sh_degree: int = 0, seed: int = 0) -> dict[str,
     return {name: np.array(column, np.float32) for name, column in columns.items()}
 
 
-def node_stream(scene: Scene) -> NodeStream:
+def node_stream(scene: Scene) -> Reader:
     """The nodes of a scene with a tree, copied whenever they are read."""
     tree = scene.tree
     assert tree is not None
 
-    def read(start: int, stop: int) -> tuple[Splats, LodTree]:
-        assert 0 <= start < stop <= len(scene)
-        part = slice(start, stop)
-        return scene.splats.take(part), LodTree(tree.child_count[part].copy(), tree.child_start[part].copy())
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
+        part = slice(target.start, target.stop)
+        assert 0 <= target.start < target.stop <= len(scene) and target.tree is not None
+        for name in COLUMNS:
+            getattr(target.splats, name)[:] = getattr(scene.splats, name)[part]
+        target.tree.child_count[:], target.tree.child_start[:] = tree.child_count[part], tree.child_start[part]
 
-    return NodeStream(len(scene), scene.splats.sh_degree, scene.antialiased, read)
+    return Reader(len(scene), scene.splats.sh_degree, "", fill, scene.antialiased, has_tree=True)
 
 
 def write_files(out: Output, files: Files) -> int:

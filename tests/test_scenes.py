@@ -25,9 +25,9 @@ from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod.budget import Budget, parse_budget
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.gaussian import moved, placed, spark_size
-from sparklod_cli.model.instances import Instance, names_of
+from sparklod_cli.model.instances import DetailScene, Instance, names_of
 from sparklod_cli.model.lod_tree import CHUNK_NODES
-from sparklod_cli.model.scene import DetailScene, Scene
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.color_scales import numbers_of, scale_of_splats, values_of
 from sparklod_cli.render.render_settings import RenderSettings

@@ -19,8 +19,8 @@ from ..cameras.sources import CameraPath
 from ..cameras.sources import orbit as orbit_cameras
 from ..codecs.formats import PRECISIONS
 from ..images import metrics
-from ..model.instances import Instance, names_of
-from ..model.scene import DetailScene, Scene
+from ..model.instances import DetailScene, Instance, names_of
+from ..model.scene import Scene
 from ..render.rasterizer import Image
 from ..render.render_settings import RenderSettings
 from ..render.renderer import Renderer

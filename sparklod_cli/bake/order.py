@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import functools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..codecs.encoder import windows_of
+from ..codecs.reader import Reader, RowBuffer
 from ..lod.chunk_order import MOST_FAMILIES, band_order, family_order
 from ..lod.kernels.tree_links import find_limits
 from ..lod.stages import NO_FAMILY, STAGE_BITS
 from ..lod.tree_settings import BUILDERS
-from ..model.lod_tree import CHUNK_NODES, LodTree, NodeStream
+from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import rotated_axis
 from ..model.sh import degree_of, width_of
 from ..model.splats import COLUMNS, FloatArray, Splats
@@ -244,13 +244,21 @@ def _keys(store: Store, run: Run, words: int) -> NDArray[np.uint64]:
     return np.pad(key, ((0, 0), (words - key.shape[1], 0)))
 
 
-def node_stream(job: Job, count: int) -> NodeStream:
-    """Return the nodes of an ordered tree."""
-    read = functools.partial(_read, job.store, width_of(job.sh_degree))
+def node_stream(job: Job, count: int) -> Reader:
+    """Return a reader of the nodes of an ordered tree."""
+    store, width = job.store, width_of(job.sh_degree)
+
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
+        splats, tree = _read(store, width, target.start, target.stop, threads)
+        assert target.tree is not None
+        for name in COLUMNS:
+            getattr(target.splats, name)[:] = getattr(splats, name)
+        target.tree.child_count[:], target.tree.child_start[:] = tree.child_count, tree.child_start
+
     up = job.settings.up or job.stream.up
     if up is not None and job.settings.transform is not None:
         up = rotated_axis(up, job.settings.transform.rotation)
-    return NodeStream(count, job.sh_degree, job.stream.antialiased, read, up)
+    return Reader(count, job.sh_degree, "", fill, job.stream.antialiased, up=up, has_tree=True)
 
 
 def encode(job: Job, start: int, stop: int, *, threads: int, progress: Progress) -> None:
@@ -276,7 +284,7 @@ def encoded_array(store: Store, number: int, name: str) -> NDArray[np.generic]:
 
 
 def _read(store: Store, width: int, start: int, stop: int, threads: int = 1) -> tuple[Splats, LodTree]:
-    """Read nodes as `NodeStream.read`, from rows of this width."""
+    """Read a range of nodes from rows of this width; `child_start` counts from the first node of the whole tree."""
     parts = []
     for window in range(start // WINDOW_NODES, -(-stop // WINDOW_NODES)):
         first = window * WINDOW_NODES

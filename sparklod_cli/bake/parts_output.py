@@ -16,7 +16,8 @@ from ..codecs.options import WriteOptions
 from ..lod.tree_settings import DetailSettings, TileSettings
 from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..model.gaussian import lod_opacity
-from ..model.scene import DetailScene, Scene
+from ..model.instances import DetailScene
+from ..model.scene import Scene
 from ..model.sh import degree_of
 from ..model.splats import Splats
 from ..render.kernels.ellipse import Limits

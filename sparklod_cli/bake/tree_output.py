@@ -26,8 +26,8 @@ from .settings import Baked, BakeSettings
 
 if TYPE_CHECKING:
     from ..codecs.encoder import Encoder, Windows
+    from ..codecs.reader import Reader
     from ..codecs.statistics import Statistics
-    from ..model.lod_tree import NodeStream
 
 
 @dataclass(kw_only=True, eq=False)
@@ -57,7 +57,7 @@ class BuiltTree:
     stored: Any = None
     before: Splats | None = None
     repacked: Place | None = None
-    nodes: Scene | NodeStream | None = None
+    nodes: Scene | Reader | None = None
     baked: Baked = field(default_factory=Baked)
     environment: Splats | None = None
     statistics: Statistics | None = None

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.gaussian import size_factor, spark_size
-from ..model.lod_tree import MAX_CHILDREN, LodTree, Nodes
+from ..model.lod_tree import CHUNK_NODES, MAX_CHILDREN, LodTree
 from ..model.scene import SPZ_SCALES, FileCoding, ScaleCoding
 from ..model.splats import FloatArray, Splats
 from ..system.errors import FormatError
@@ -32,6 +33,36 @@ NODE = np.dtype(
     ]
 )
 assert NODE.itemsize == 16
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """N nodes of a tree, which is not validated, with (N, 3) float32 centres and (N,) feature sizes, world units."""
+
+    center: FloatArray
+    size: FloatArray
+    tree: LodTree
+
+    #: Whether nodes are read from the file when cuts need them.
+    paged: ClassVar[bool] = False
+
+    @property
+    def count(self) -> int:
+        return len(self.size)
+
+    @property
+    def chunks(self) -> int:
+        return -(-self.count // CHUNK_NODES)
+
+    @property
+    def depth(self) -> NDArray[np.int32]:
+        return self.tree.depths()
+
+    def fill(self, rows: NDArray[np.void]) -> None:
+        """Fill (N,) `pixel_scale.NODE`."""
+        rows["x"], rows["y"], rows["z"] = self.center.T
+        rows["size"] = self.size
+        rows["child_start"], rows["child_count"] = self.tree.first_child(), self.tree.child_count
 
 
 def pack(splats: Splats, tree: LodTree, *, threads: int = 1) -> dict[str, Words]:

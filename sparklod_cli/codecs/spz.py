@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..model import MAX_SH_DEGREE
 from ..model.gaussian import linear_opacity, lod_opacity
-from ..model.lod_tree import LodTree, NodeStream
+from ..model.lod_tree import LodTree
 from ..model.scene import SPZ_SCALES, FileCoding, Scene
 from ..model.sh import COEFFICIENTS, notes_on_degree
 from ..model.splats import COLUMNS, FloatArray, Splats
@@ -591,7 +591,7 @@ class SpzEncoder:
 
 
 def encoder(
-    scene: Scene | NodeStream,
+    scene: Scene | Reader,
     options: WriteOptions,
     *,
     counting: bool = False,
@@ -607,7 +607,7 @@ def encoder(
     if isinstance(scene, Scene):
         count, sh_degree, has_tree = len(scene), scene.splats.sh_degree, scene.tree is not None
     else:
-        count, sh_degree, has_tree = scene.count, scene.sh_degree, True
+        count, sh_degree, has_tree = scene.count, scene.sh_degree, scene.has_tree
     flags = ANTIALIASED * scene.antialiased | LOD * has_tree
     layout = Layout(options.spz_version, count, sh_degree, options.fractional_bits, flags)
     return SpzEncoder(layout, scene.up, options, SPZ_RANGES if counting else ())

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..model import morton
-from ..model.scene import Bounds, Counts, DetailScene, Scene, facts_of
+from ..model.instances import Bounds, Counts, DetailScene
+from ..model.scene import Scene, facts_of
 from ..model.sh import width_of
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent

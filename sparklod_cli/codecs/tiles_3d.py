@@ -17,7 +17,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.scene import Scene, TileScene, common_axis, facts_of
+from ..model.instances import TileScene
+from ..model.scene import Scene, common_axis, facts_of
 from ..model.sh import width_of
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.scene import Bounds
+from ..model.instances import Bounds
 from ..model.splats import Splats
 from ..system.errors import FormatError, UnsupportedError, VersionError
 from ..system.progress import Progress, silent

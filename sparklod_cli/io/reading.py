@@ -26,7 +26,7 @@ from ..system.units import count_of
 from .files import open_splats, opened, readable
 
 if TYPE_CHECKING:
-    from ..model.scene import DetailScene, TileScene
+    from ..model.instances import DetailScene, TileScene
     from ..model.transforms import Transform
 
 #: Files of one scene that stay open, and files that are opened again and stay open: each has a palette of up to 12 MB.

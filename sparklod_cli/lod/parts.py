@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from ..model.falloff import harmonic
 from ..model.gaussian import covariance, rotation_matrices, spark_size
+from ..model.instances import DetailScene, TileScene
 from ..model.lod_tree import LodTree
-from ..model.scene import DetailScene, TileScene
 from ..model.splats import FloatArray, Splats
 from ..system.errors import InvalidSplatsError
 from ..system.progress import Progress, silent

@@ -1,16 +1,14 @@
-"""`LodTree`, the child columns of a Level-of-Detail tree; `Nodes` and `NodeStream`, a tree with its splats."""
+"""`LodTree`: the child columns of a Level-of-Detail tree."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..system.errors import TreeError
-from .splats import FloatArray, Splats
 
 #: The most children of a node: child counts are uint16 in Spark's nodes and in SPZ files.
 MAX_CHILDREN = 65535
@@ -129,52 +127,3 @@ class LodTree:
 #: Nodes of a chunk, the unit in which Spark streams trees; as a power of 2.
 CHUNK_BITS = 16
 CHUNK_NODES = 1 << CHUNK_BITS
-
-
-@dataclass(frozen=True)
-class Nodes:
-    """N nodes of a tree, which is not validated, with (N, 3) float32 centres and (N,) feature sizes, world units."""
-
-    center: FloatArray
-    size: FloatArray
-    tree: LodTree
-
-    #: Whether nodes are read from the file when cuts need them.
-    paged: ClassVar[bool] = False
-
-    @property
-    def count(self) -> int:
-        return len(self.size)
-
-    @property
-    def chunks(self) -> int:
-        return -(-self.count // CHUNK_NODES)
-
-    @property
-    def depth(self) -> NDArray[np.int32]:
-        return self.tree.depths()
-
-    def fill(self, rows: NDArray[np.void]) -> None:
-        """Fill (N,) `pixel_scale.NODE`."""
-        rows["x"], rows["y"], rows["z"] = self.center.T
-        rows["size"] = self.size
-        rows["child_start"], rows["child_count"] = self.tree.first_child(), self.tree.child_count
-
-
-@dataclass(frozen=True, eq=False)
-class NodeStream:
-    """The M nodes of a tree in their final order, read window by window.
-
-    Attributes:
-        count: M.
-        sh_degree: of all windows.
-        antialiased, up: as in `Scene`.
-        read: called with a range of nodes, returns them and their tree columns, whose `child_start` counts from the
-            first node of the whole tree; may be called again, from several threads at once.
-    """
-
-    count: int
-    sh_degree: int
-    antialiased: bool
-    read: Callable[[int, int], tuple[Splats, LodTree]]
-    up: str | None = None

@@ -35,8 +35,8 @@ from ..codecs.tileset import MAX_TILESET
 from ..codecs.zip_folder import ZipFolder
 from ..io.files import check_companion, in_folder, open_named, open_plain, reason_unreadable, unknown_format
 from ..io.reading import read_parts, read_scene
+from ..model.instances import DetailScene, TileScene
 from ..model.lod_tree import CHUNK_NODES
-from ..model.scene import DetailScene, TileScene
 from ..model.splats import Splats
 from ..system.errors import FormatError, InvalidSplatsError, NotSplatsError, UnreadableError, naming, reason_of
 from ..system.progress import Progress, silent

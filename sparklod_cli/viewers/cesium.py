@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
 from ..lod.parts import PIXEL_ERROR
-from ..model.scene import TileScene
+from ..model.instances import TileScene
 from .loaded_scene import TILES, Forest, Index, LoadedScene, TreeCut, TreeInstance, bytes_of, cut_of_runs
 from .viewer_settings import CESIUM_FETCHERS
 

@@ -16,13 +16,14 @@ from ..codecs.formats import PRECISIONS
 from ..lod.kernels import pixel_scale
 from ..model.foveation import Cones, Foveation
 from ..model.gaussian import spark_size
-from ..model.lod_tree import CHUNK_NODES, LodTree, Nodes
+from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene
 from ..model.splats import COLUMNS, Splats
 from .viewer_settings import FETCHERS
 
 if TYPE_CHECKING:
     from ..cameras.camera import Camera
+    from ..codecs.spark_nodes import Nodes
     from ..model.scene import FileCoding
 
 Matrix = NDArray[np.float64]
@@ -321,10 +322,10 @@ def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
 
 def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding | None, *, precision: str, threads: int) -> Nodes:
     """Return nodes as a traversal reads them, in one of `codecs.formats.PRECISIONS`."""
-    if precision == "float32":
-        return Nodes(splats.center, spark_size(splats), tree)
     from ..codecs import spark_nodes
 
+    if precision == "float32":
+        return spark_nodes.Nodes(splats.center, spark_size(splats), tree)
     if precision == "float16":
         return spark_nodes.unpack(spark_nodes.pack(splats, tree, threads=threads))
     return spark_nodes.nodes(splats, tree, precision, coding, threads=threads)

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from ..cameras.framing import SAMPLE, USED, Balls, balls_of
 from ..codecs.rad.rad_reader import RadReader
+from ..codecs.spark_nodes import Nodes
 from ..io.files import reopened
 from ..lod.kernels.pixel_scale import NODE
 from ..model.instances import Instance
-from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree, Nodes
+from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
 from ..model.scene import FileCoding
 from ..model.splats import COLUMNS, Splats
 from ..system.errors import TreeError, naming

@@ -21,7 +21,7 @@ from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.streamed_manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..codecs.streamed_sog import layout_of
 from ..io.files import opened
-from ..model.scene import DetailScene
+from ..model.instances import DetailScene
 from ..system.errors import FormatError
 from .loaded_scene import STREAMED_SOG, Forest, Index, LoadedScene, TreeCut, TreeInstance, bytes_of, cut_of_runs
 from .viewer_settings import CONNECTIONS, LEAST_BASE_DISTANCE, PLAYCANVAS_FETCHERS, DetailRule

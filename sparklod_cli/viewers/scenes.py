@@ -21,9 +21,9 @@ from ..codecs.reader import Reader
 from ..io.files import opened, size_of_input
 from ..lod.budget import Budget
 from ..model.gaussian import placed
-from ..model.instances import Instance, Matrix
+from ..model.instances import DetailScene, Instance, Matrix, TileScene
 from ..model.lod_tree import CHUNK_NODES, LodTree
-from ..model.scene import DetailScene, Scene, TileScene, common_axis, facts_of, rotated_axis
+from ..model.scene import Scene, common_axis, facts_of, rotated_axis
 from ..model.selection import Selection, describe
 from ..model.splats import COLUMNS, Splats
 from ..system.errors import FormatError, InvalidSplatsError, TreeError, UnfitError, memory_errors_translated, naming

@@ -34,6 +34,7 @@ from sparklod_cli.codecs.encoder import windows_of
 from sparklod_cli.codecs.formats import ENCODINGS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WRITABLE
 from sparklod_cli.codecs.options import RadOptions, SogOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad_options
+from sparklod_cli.codecs.reader import Reader
 from sparklod_cli.codecs.spark_codings import log_scale_table
 from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.fitting.fit_settings import FitSettings
@@ -46,7 +47,6 @@ from sparklod_cli.lod.budget import parse_budget
 from sparklod_cli.lod.chunk_order import viewpoints
 from sparklod_cli.lod.tree_settings import METHODS, DetailSettings, TileSettings
 from sparklod_cli.model.gaussian import normalized_quat
-from sparklod_cli.model.lod_tree import NodeStream
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.selection import Selection, SelectionTally
 from sparklod_cli.model.sh import COEFFICIENTS
@@ -395,11 +395,11 @@ def tree_scene() -> Scene:
     return Scene(*quick.build(splats, 1.5))
 
 
-def write_stream(target: Path, how: BakeSettings, scene: Scene, nodes: Scene | NodeStream, last: float) -> Baked:
+def write_stream(target: Path, how: BakeSettings, scene: Scene, nodes: Scene | Reader, last: float) -> Baked:
     """Write a tree window by window; reading windows after `last` fails."""
 
     def encode(tree: BuiltTree, encoder: encoding.Encoder) -> encoding.Windows:
-        read = nodes.read if isinstance(nodes, NodeStream) else node_stream(nodes).read
+        read = nodes.read if isinstance(nodes, Reader) else node_stream(nodes).read
         windows = [encoder.encode(*read(part.start, part.stop), part.start) for part in windows_of(len(scene))]
 
         def window(number: int, name: str) -> np.ndarray:

@@ -13,7 +13,7 @@ from sparklod_cli.bake import parts_output
 from sparklod_cli.bake.parts_output import measured
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.model.gaussian import covariance
-from sparklod_cli.model.scene import DetailScene
+from sparklod_cli.model.instances import DetailScene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render import rasterizer
 from sparklod_cli.render.rasterizer import shade

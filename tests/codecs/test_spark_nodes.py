@@ -18,10 +18,11 @@ from hypothesis.extra.numpy import arrays
 from sparklod_cli.codecs import ext_splats, packed_splats, quantize, spark_codings, spark_nodes
 from sparklod_cli.codecs.formats import LOADED
 from sparklod_cli.codecs.spark_codings import SplatEncoding, log_scale_table
+from sparklod_cli.codecs.spark_nodes import Nodes
 from sparklod_cli.lod import quick
 from sparklod_cli.model import gaussian
 from sparklod_cli.model.gaussian import linear_opacity
-from sparklod_cli.model.lod_tree import LodTree, Nodes
+from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import PLAIN_SCALES, SPZ_SCALES, FileCoding, ScaleCoding, Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import FormatError

@@ -25,7 +25,8 @@ from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model import morton
-from sparklod_cli.model.scene import DetailScene, Scene
+from sparklod_cli.model.instances import DetailScene
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import FormatError, VersionError
 from tests.codecs.cases import assert_same, decode, linear

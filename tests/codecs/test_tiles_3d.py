@@ -21,7 +21,8 @@ from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.parts import make_tiles
 from sparklod_cli.lod.tree_settings import TileSettings
-from sparklod_cli.model.scene import AXES, Scene, TileScene
+from sparklod_cli.model.instances import TileScene
+from sparklod_cli.model.scene import AXES, Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.system.errors import FormatError

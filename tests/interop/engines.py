@@ -31,7 +31,7 @@ from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import parts, quality
 from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.gaussian import rotation_matrices
-from sparklod_cli.model.scene import DetailScene
+from sparklod_cli.model.instances import DetailScene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.rasterizer import ShadedSplats, draw, shade, world_to_camera
 from sparklod_cli.render.render_settings import RasterSettings

@@ -20,12 +20,13 @@ from sparklod_cli.codecs import ext_splats, spark_nodes, spz
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.spark_codings import SplatEncoding
+from sparklod_cli.codecs.spark_nodes import Nodes
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.gaussian import linear_opacity
 from sparklod_cli.model.instances import Instance
-from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import FloatArray
 from sparklod_cli.simulation.frames import Simulation

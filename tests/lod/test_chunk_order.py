@@ -12,13 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sparklod_cli.codecs.spark_nodes import Nodes
 from sparklod_cli.lod import chunk_order, quality, quick
 from sparklod_cli.lod.chunk_order import arrange, banded, family_order, parts_of
 from sparklod_cli.lod.kernels.chunk_sets import LANES, fill_demand
 from sparklod_cli.lod.kernels.pixel_scale import NODE
 from sparklod_cli.lod.kernels.tree_links import find_limits
 from sparklod_cli.model.gaussian import spark_size
-from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree, Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES, LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.threads import on_threads
 from sparklod_cli.viewers.loaded_scene import Forest, TreeCut, TreeInstance

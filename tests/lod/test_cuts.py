@@ -12,9 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparklod_cli.model import lod_tree
+from sparklod_cli.codecs import spark_nodes
+from sparklod_cli.codecs.spark_nodes import Nodes
 from sparklod_cli.model.foveation import Cones, Frustum
-from sparklod_cli.model.lod_tree import CHUNK_NODES, Nodes
+from sparklod_cli.model.lod_tree import CHUNK_NODES
 from sparklod_cli.simulation.frames import Changes, CutStatistics, measure
 from sparklod_cli.viewers import spark
 from sparklod_cli.viewers.loaded_scene import Forest, TreeCut, TreeInstance, views_of
@@ -237,7 +238,7 @@ def small_chunks() -> Iterator[None]:
     """Small chunks, so that small trees have many."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spark, "CHUNK_BITS", SMALL)
-        for module in (spark, lod_tree):
+        for module in (spark, spark_nodes):
             patch.setattr(module, "CHUNK_NODES", 1 << SMALL)
         yield
 

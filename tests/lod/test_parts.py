@@ -38,8 +38,8 @@ from sparklod_cli.lod.parts import (
 )
 from sparklod_cli.lod.tree_settings import DetailSettings, TileSettings
 from sparklod_cli.model.gaussian import covariance, rotation_matrices, spark_size
+from sparklod_cli.model.instances import DetailScene, TileScene
 from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.scene import DetailScene, TileScene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import InvalidSplatsError
 from sparklod_cli.system.threads import on_threads

@@ -20,7 +20,8 @@ from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality
 from sparklod_cli.lod.parts import make_tiles
 from sparklod_cli.lod.tree_settings import TileSettings
-from sparklod_cli.model.scene import Scene, TileScene
+from sparklod_cli.model.instances import TileScene
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.viewers import cesium
 from sparklod_cli.viewers.cesium import CesiumViewer, LoadedTiles
 from sparklod_cli.viewers.loaded_scene import Forest, TreeInstance

@@ -14,11 +14,12 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from sparklod_cli.codecs.spark_nodes import Nodes
 from sparklod_cli.lod.stages import NO_FAMILY, STAGE_BITS, Pending, Region, StagedBuilder, StageFamilies, check
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.gaussian import MAX_OPACITY, MIN_OPACITY
-from sparklod_cli.model.lod_tree import LodTree, Nodes
-from sparklod_cli.model.scene import DetailScene
+from sparklod_cli.model.instances import DetailScene
+from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.system.progress import silent
 from sparklod_cli.system.threads import on_threads

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from sparklod_cli.codecs.merging import Placed, merged
 from sparklod_cli.codecs.reader import Reader, RowBuffer
 from sparklod_cli.model.gaussian import placed
-from sparklod_cli.model.instances import Instance
+from sparklod_cli.model.instances import DetailScene, Instance
 from sparklod_cli.model.lod_tree import LodTree
-from sparklod_cli.model.scene import DetailScene, Scene
+from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.system.errors import FormatError, TreeError

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from zlib_ng import zlib_ng
 
-from ...model.lod_tree import CHUNK_NODES, LodTree, NodeStream
+from ...model.lod_tree import CHUNK_NODES, LodTree
 from ...model.scene import Scene
 from ...model.sh import COEFFICIENTS
 from ...model.splats import COLUMNS, FloatArray, Splats
@@ -28,7 +28,7 @@ from .. import quantize, sh_palette, spark_codings
 from ..encoder import CLAMPED, CodeRange, Encoded, Windows, results, tally, windows_of
 from ..options import AUTO, DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
 from ..quantize import Bytes
-from ..reader import OpenFile, comment_of
+from ..reader import OpenFile, Reader, comment_of
 from ..spark_codings import LARGEST_END, SCALE_ZERO, SplatEncoding
 from ..statistics import EXACT_BITS, LOWER, SMALL_QUANTILE, UPPER, Distribution, Statistics, fine_bits, tops
 from .property_codings import BLOCK, BY_NAME, CODINGS, GZ, LARGEST_F16, PROPERTIES, Property, Row, encodings_of
@@ -248,7 +248,7 @@ class Palette:
     labels: NDArray[np.uint32] | None
 
     @classmethod
-    def of(cls, scene: Scene | NodeStream, most: int, threads: int, progress: Progress) -> Palette:
+    def of(cls, scene: Scene | Reader, most: int, threads: int, progress: Progress) -> Palette:
         """Cluster the SH of a scene to at most `most` codes; zeros follow, up to as many as Spark reads."""
         if isinstance(scene, Scene):
             splats, count = scene.splats, len(scene)
@@ -268,7 +268,7 @@ class Palette:
         return sh_palette.labels_of(splats.sh, self.codes[: self.used])
 
 
-def _sample(nodes: NodeStream) -> Splats:
+def _sample(nodes: Reader) -> Splats:
     """Read runs of nodes, evenly spread over all."""
     if nodes.count <= SAMPLE:
         return nodes.read(0, nodes.count)[0]
@@ -438,7 +438,7 @@ class RadEncoder:
 
 
 def encoder(
-    scene: Scene | NodeStream,
+    scene: Scene | Reader,
     options: WriteOptions,
     *,
     counting: bool = False,
@@ -455,7 +455,7 @@ def encoder(
     if isinstance(scene, Scene):
         count, sh_degree, has_tree = len(scene), scene.splats.sh_degree, scene.tree is not None
     else:
-        count, sh_degree, has_tree = scene.count, scene.sh_degree, True
+        count, sh_degree, has_tree = scene.count, scene.sh_degree, scene.has_tree
     if most is not None and sh_degree and count:
         palette = Palette.of(scene, most, threads, progress)
     entries = None if palette is None else len(palette.codes)
