@@ -184,7 +184,7 @@ def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None 
         TypeError: the number is not a whole one.
         ValueError: there is no such chunk, or the palette is of another SH degree than the file.
     """
-    from ..codecs.rad.rad_reader import file_of, read_chunk
+    from ..codecs.rad.rad_reader import RadReader
 
     path = Path(path)
     if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
@@ -192,9 +192,7 @@ def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None 
     with memory_errors_translated(), _opened_rad(path) as (file, header):
         if not 0 <= number < len(header.chunks):
             raise ValueError(f"number is {number}; its chunks are 0 to {len(header.chunks) - 1}")
-        entry = header.chunks[number]
-        with file_of(entry, file, functools.partial(open_named, path)) as source:
-            return read_chunk(source, entry, header, palette)
+        return RadReader(header, file, functools.partial(open_named, path), palette).read_chunk(number)
 
 
 @contextlib.contextmanager

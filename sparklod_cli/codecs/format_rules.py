@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,9 +31,14 @@ class RuleViolation:
     fatal: bool = True
 
 
-def violation(format: str, code: str, text: str, *, fatal: bool = True) -> RuleViolation:
-    """Return a violation of a rule of a format, by the last part of its code."""
-    return RuleViolation(f"{format}.{code}", text, fatal)
+def violation(readable: Collection[str], format: str, code: str, text: str, fatal: bool | None = None) -> RuleViolation:
+    """Return a violation of a rule by the name of the format and of the rule.
+
+    Args:
+        readable: codes whose violations are not `fatal`, unless that is given.
+    """
+    code = f"{format}.{code}"
+    return RuleViolation(code, text, code not in readable if fatal is None else fatal)
 
 
 def check_rules(violations: Iterable[RuleViolation]) -> None:

@@ -1,7 +1,7 @@
 """The manifest of Streamed SOG, lod-meta.json, as it is read and written.
 
-Parsing checks what reading needs; all other rules, of the manifest, chunk files and their splats, are checked for
-reports and for the reader, so that a file which breaks them can be reported on.
+Parsing checks what reading needs; all other rules, of the manifest, chunk files and their splats, are checked apart,
+so that a report can name every rule that a file breaks.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import json
 import math
 import posixpath
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, BinaryIO
 
@@ -32,22 +32,22 @@ from .merging import Chunk, SceneFiles, not_finite
 from .reader import FileNote, OpenCompanion, code_of, read_note
 from .sog import MAX_META, image_names, parse_meta
 
-#: The version that is read and written. A manifest from before versions has none.
+#: Version that is read and written; old manifests have none.
 VERSION = 1
 
-#: Largest manifest, bytes: that of 100,000 regions at some levels.
+#: Largest manifest in bytes; fits 100,000 regions at several levels.
 MAX_MANIFEST = 1 << 25
 
 #: Most detail levels; tools write up to ten.
 MAX_LEVELS = 32
 
-#: Most splats of a run, and its largest offset: no image of a SOG has more texels.
+#: Most splats of a run, and its largest offset: the texels of the largest image of a SOG.
 MAX_RUN = 1 << 28
 
 #: Most nodes of the tree: twice as many as there are regions of 8,192 splats in 500 million. Chosen.
 MAX_NODES = 1 << 17
 
-#: The largest magnitude of a coordinate of a bound: that of float32.
+#: Largest magnitude of a coordinate of a bound, that of float32.
 LARGEST = float(quantize.LARGEST)
 
 #: Significant digits: those of a float32.
@@ -62,7 +62,7 @@ Bound = tuple[Corner, Corner]
 
 @dataclass(frozen=True)
 class Run:
-    """Run of `count` splats of a region at a detail level, from `offset` on in a file, by its number."""
+    """Splats of a region at one detail level: `count` of them from `offset` on in the file with the number `file`."""
 
     file: int
     offset: int
@@ -75,10 +75,10 @@ class ManifestNode:
 
     Attributes:
         bound: lowest and highest corner in world units; None if it is missing, or not finite.
-        children: numbers of nodes, ascending; none of a region.
-        runs: of a region, by detail level; None where the node has no `lods`.
-        errors: of a region, not checked; None without errors.
-        parent: number of the node above, -1 of the root.
+        children: numbers of the child nodes, ascending; empty for a region.
+        runs: runs of a region by detail level; None if the node has no `lods`.
+        errors: unchecked value of a region; None if there is none.
+        parent: number of the parent, -1 for the root.
     """
 
     bound: Bound | None
@@ -94,10 +94,10 @@ class Manifest:
 
     Attributes:
         levels: number of detail levels.
-        filenames: paths of the meta.json of each chunk, from the folder of the manifest on.
-        nodes: of the tree, depth first; regions are counted in this order.
+        filenames: path of the meta.json of each chunk, relative to the manifest's folder.
+        nodes: nodes of the tree, depth first; regions are numbered in this order.
         environment: path of the meta.json of the environment.
-        head: all other keys at the top level, not checked: "version", "asset", "count", "counts", "lodErrors".
+        head: other keys at the top level, unchecked: "version", "asset", "count", "counts", "lodErrors".
     """
 
     levels: int
@@ -111,24 +111,24 @@ class Manifest:
         return read_note(self.head.get("asset"))
 
     def place(self, number: int) -> str:
-        """Return the place of a node in the file: "tree.children[0]"."""
+        """Return the place of a node in the file, such as "tree.children[0]"."""
         return place_of("tree", number, lambda each: self.nodes[each].parent, lambda each: self.nodes[each].children)
 
     def regions(self) -> Iterator[tuple[int, ManifestNode]]:
-        """Return the nodes without children, and their numbers."""
+        """Return the nodes without children with their numbers."""
         return ((number, node) for number, node in enumerate(self.nodes) if not node.children)
 
     def names(self) -> list[str]:
         return [*self.filenames, *([] if self.environment is None else [self.environment])]
 
     def read_names(self) -> list[str]:
-        """Return the files that readers of the scene open: `names` without chunk files that no run uses."""
+        """Return the files that readers of the scene open, without chunk files that no run uses."""
         read = {run.file for _, node in self.regions() for run in (node.runs or {}).values() if run.count}
         return [name for number, name in enumerate(self.names()) if number in read or number >= len(self.filenames)]
 
 
 def parse(data: bytes) -> Manifest:
-    """Parse the bytes of a lod-meta.json; errors name the value and its place."""
+    """Parse a lod-meta.json; errors name the value and its place."""
     root = parse_manifest(data, MANIFEST, MAX_MANIFEST)
     version = root.value.get("version")
     if version is not None and (type(version) is not int or version != VERSION):
@@ -154,7 +154,7 @@ def _nodes(tree: Json, levels: int, files: int) -> tuple[ManifestNode, ...]:
 
 
 def _runs(lods: Json, keys: Mapping[str, int], files: int) -> dict[int, Run]:
-    """Return the runs of a region by detail level; `keys` has the levels by their names."""
+    """Return the runs of a region by detail level; `keys` are the levels by their keys in the file."""
     runs = dict[int, Run]()
     for key, run in lods.entries():
         if key not in keys:
@@ -178,10 +178,7 @@ def _bound(value: Any) -> Bound | None:
 
 
 def serialise(manifest: Manifest) -> bytes:
-    """Return the bytes of a lod-meta.json.
-
-    Bounds are rounded outward. `lodLevels` comes early, since a file is recognised by it, and the tree last.
-    """
+    """Encode a lod-meta.json, with bounds rounded outward; `lodLevels` identifies the format and so comes early."""
     head = dict(manifest.head)
     first: dict[str, Any] = {key: head.pop(key) for key in ("version", "asset", "count", "counts") if key in head}
     first |= {"lodLevels": manifest.levels} | head
@@ -192,18 +189,17 @@ def serialise(manifest: Manifest) -> bytes:
 
 
 def _tree(nodes: tuple[ManifestNode, ...]) -> str:
-    """Write the tree, node by node from its end, since it may be too deep for recursion."""
+    """Encode the tree from its last node on, since it may be too deep for recursion."""
     texts = [""] * len(nodes)
     for number in reversed(range(len(nodes))):
         node = nodes[number]
         parts = []
         if node.bound is not None:
-            low, high = node.bound
-            corners = (
-                _json_list(_rounded(_DOWN, each) for each in low),
-                _json_list(_rounded(_UP, each) for each in high),
+            low, high = (
+                _json_list(_rounded(rounding, each) for each in corner)
+                for rounding, corner in zip((_DOWN, _UP), node.bound, strict=True)
             )
-            parts.append('"bound":{{"min":{},"max":{}}}'.format(*corners))
+            parts.append(f'"bound":{{"min":{low},"max":{high}}}')
         if node.children:
             parts.append(f'"children":{_json_list(texts[child] for child in node.children)}')
             for child in node.children:
@@ -217,7 +213,7 @@ def _tree(nodes: tuple[ManifestNode, ...]) -> str:
 
 
 def _rounded(rounding: decimal.Context, number: float) -> str:
-    """Round a number of a bound to one side, but not out of float32; with few enough digits it stays as it is."""
+    """Round a number of a bound to `DIGITS` digits; beyond float32 it stays as it is."""
     rounded = float(rounding.create_decimal(repr(number)))
     return f"{rounded:.{DIGITS}g}" if abs(rounded) <= LARGEST else repr(number)
 
@@ -230,8 +226,8 @@ def _json(value: Mapping[str, Any]) -> str:
     return json.dumps(value, separators=(",", ":"))
 
 
-#: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which
-#: the parser refuses, have the codes "container.corrupt" and "container.version", as in other formats.
+#: Meaning of each code; the text of a violation has the values. Values that the parser refuses have the codes
+#: "container.corrupt" and "container.version", as in other formats.
 ERRORS = {
     "streamed-sog.nodes": "a node of the tree has neither two children nor runs, or it has both",
     "streamed-sog.bounds": "a bound is missing, not finite, or begins beyond its end",
@@ -256,23 +252,26 @@ WARNINGS = {
     "streamed-sog.order": "the splats of a run are not in Morton order",
 }
 
-#: By how much two equal bounds may differ, as a share of their largest number: seven digits are written.
+#: Rules that a readable file may break.
+READABLE = {*WARNINGS, *(f"streamed-sog.{name}" for name in ("union", "extents", "counts", "mixed"))}
+broken = functools.partial(violation, READABLE, "streamed-sog")
+
+#: Allowed difference of two equal bounds, as a share of their largest number: seven digits are written.
 ROUNDING = 1e-5
-broken = functools.partial(violation, "streamed-sog")
 
 
 def regions_of(manifest: Manifest) -> Iterator[tuple[int, Mapping[int, Run], ManifestNode]]:
-    """Return the number of each region, its runs, and its node; not the leaves of a broken tree that have no runs."""
+    """Yield the number, runs and node of each region; leaves of a broken tree that have no runs are left out."""
     return ((number, node.runs, node) for number, node in manifest.regions() if node.runs is not None)
 
 
 def is_box(bound: Bound) -> bool:
-    """Return True if no end of a bound is below its beginning."""
+    """Return whether the lowest corner of a bound is not above the highest on any axis."""
     return all(low <= high for low, high in zip(*bound, strict=True))
 
 
 def violations(manifest: Manifest) -> Iterator[RuleViolation]:
-    """Yield the broken rules of a manifest."""
+    """Yield the rules that a manifest breaks."""
     yield from _node_violations(manifest)
     yield from _name_violations(manifest)
     yield from run_violations(manifest)
@@ -283,7 +282,11 @@ def violations(manifest: Manifest) -> Iterator[RuleViolation]:
 
 
 def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Iterator[RuleViolation]:
-    """Yield the broken rules about `files`: by name, what the meta.json of each says, or why it cannot be read."""
+    """Yield the rules that chunk files break.
+
+    Args:
+        files: header of each by name, or why it cannot be read.
+    """
     ends = [0] * len(manifest.filenames)
     for _, runs, _ in regions_of(manifest):
         for run in runs.values():
@@ -301,7 +304,7 @@ def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Ite
             first = first or found
             if (found.sh_degree, found.antialiased) != (first.sh_degree, first.antialiased):
                 text = f"{quoted_value(name)} has {_kind_of(found)}; the first chunk file has {_kind_of(first)}"
-                yield broken("kind", text, fatal=False)
+                yield broken("kind", text)
     environment = None if manifest.environment is None else files.get(manifest.environment)
     if isinstance(environment, str):
         yield broken("environment", environment)
@@ -310,7 +313,7 @@ def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Ite
 
 
 def _about(file: Chunk) -> Iterator[RuleViolation]:
-    """Yield the notes on a chunk file as violations."""
+    """Yield the notes on a chunk file that are findings, as violations."""
     for note in file.notes:
         if (code := code_of(note)) is not None:
             yield RuleViolation(code, f"{quoted_value(file.name)}: {note}", fatal=False)
@@ -323,10 +326,8 @@ def _kind_of(file: Chunk) -> str:
 def _node_violations(manifest: Manifest) -> Iterator[RuleViolation]:
     for number, node in enumerate(manifest.nodes):
         if len(node.children) not in (0, 2) or bool(node.children) == (node.runs is not None):
-            having = count_of(len(node.children), "child", "children")
-            place = manifest.place(number)  # not of every node: there may be many, and deep ones
-            text = f"{place} has {having} and {'no ' * (node.runs is None)}lods; a node has two children or lods"
-            yield broken("nodes", text)
+            having = f"{count_of(len(node.children), 'child', 'children')} and {'no ' * (node.runs is None)}lods"
+            yield broken("nodes", f"{manifest.place(number)} has {having}; a node has two children or lods")
         if node.bound is None:
             yield broken("bounds", f"{manifest.place(number)} has no bound of six numbers that are finite in float32")
         elif not is_box(node.bound):
@@ -347,7 +348,7 @@ def _name_violations(manifest: Manifest) -> Iterator[RuleViolation]:
 
 
 def run_violations(manifest: Manifest) -> Iterator[RuleViolation]:
-    """Check the runs in each chunk file, which hold one level and lie end to end."""
+    """Yield the chunk files whose runs are of several levels, or do not lie end to end."""
     by_file: list[list[tuple[int, int, int, int]]] = [[] for _ in manifest.filenames]
     for number, held, _ in regions_of(manifest):
         for level, run in held.items():
@@ -355,11 +356,10 @@ def run_violations(manifest: Manifest) -> Iterator[RuleViolation]:
                 by_file[run.file].append((run.offset, run.count, level, number))
     for name, runs in zip(manifest.filenames, by_file, strict=True):
         if not runs:
-            yield broken("unused", f"no region refers to {quoted_value(name)}", fatal=False)
+            yield broken("unused", f"no region refers to {quoted_value(name)}")
         levels = sorted({level for _, _, level, _ in runs})
         if len(levels) > 1:
-            text = f"{quoted_value(name)} has runs of the levels {', '.join(map(str, levels))}"
-            yield broken("mixed", text, fatal=False)
+            yield broken("mixed", f"{quoted_value(name)} has runs of the levels {', '.join(map(str, levels))}")
         at = 0
         for offset, count, level, number in sorted(runs):
             if offset != at:
@@ -371,34 +371,31 @@ def run_violations(manifest: Manifest) -> Iterator[RuleViolation]:
 def _count_violations(manifest: Manifest) -> Iterator[RuleViolation]:
     missing = [name for name in ("version", "count", "counts") if manifest.head.get(name) is None]
     if missing:
-        yield broken("old", f"it has no {', '.join(missing)}, as before version 1", fatal=False)
+        yield broken("old", f"it has no {', '.join(missing)}, as before version 1")
     held = [0] * manifest.levels
     for _, runs, _ in regions_of(manifest):
         for level, run in runs.items():
             held[level] += run.count
-    counts = manifest.head.get("counts")
-    if counts is not None and counts != held:
-        text = f"counts is {quoted_value(counts)}, but the runs have {quoted_value(held)} splats"
-        yield broken("counts", text, fatal=False)
-    count = manifest.head.get("count")
-    if count is not None and count != sum(held):
-        text = f"count is {quoted_value(count)}, but the runs have {count_of(sum(held), 'splat')}"
-        yield broken("counts", text, fatal=False)
+    for key, actual, text in (
+        ("counts", held, f"{quoted_value(held)} splats"),
+        ("count", sum(held), count_of(sum(held), "splat")),
+    ):
+        given = manifest.head.get(key)
+        if given is not None and given != actual:
+            yield broken("counts", f"{key} is {quoted_value(given)}, but the runs have {text}")
     for level, (finer, coarser) in enumerate(itertools.pairwise(held), 1):
         if coarser >= finer:
-            text = f"level {level} has {count_of(coarser, 'splat')}, level {level - 1} has {finer:,}"
-            yield broken("decreasing", text, fatal=False)
+            yield broken(
+                "decreasing", f"level {level} has {count_of(coarser, 'splat')}, level {level - 1} has {finer:,}"
+            )
 
 
 def _level_violations(manifest: Manifest) -> Iterator[RuleViolation]:
-    """Check the levels that each region has."""
     for number, runs, _ in regions_of(manifest):
         held = {level for level, run in runs.items() if run.count}
-        if 0 not in held:
-            yield broken("full-detail", f"{manifest.place(number)} has no splats at level 0", fatal=False)
-        last = manifest.levels - 1
-        if last not in held:
-            yield broken("coarsest", f"{manifest.place(number)} has no splats at level {last}", fatal=False)
+        for rule, level in (("full-detail", 0), ("coarsest", manifest.levels - 1)):
+            if level not in held:
+                yield broken(rule, f"{manifest.place(number)} has no splats at level {level}")
 
 
 def _union_violations(manifest: Manifest) -> Iterator[RuleViolation]:
@@ -411,14 +408,11 @@ def _union_violations(manifest: Manifest) -> Iterator[RuleViolation]:
         size = max(map(abs, (*low, *high)))
         given = (*node.bound[0], *node.bound[1])
         if any(abs(a - b) > ROUNDING * size for a, b in zip(given, (*low, *high), strict=True)):
-            children = _text(((low[0], low[1], low[2]), (high[0], high[1], high[2])))
-            text = (
-                f"the bound of {manifest.place(number)} is {_text(node.bound)}, but that of its children is {children}"
-            )
-            yield broken("union", text, fatal=False)
+            text = f"the bound of {manifest.place(number)} is {_text(node.bound)}"
+            yield broken("union", f"{text}, but that of its children is {_text((low, high))}")
 
 
-def _text(bound: Bound) -> str:
+def _text(bound: Sequence[Sequence[float]]) -> str:
     return " to ".join(" ".join(f"{x:.7g}" for x in corner) for corner in bound)
 
 
@@ -432,15 +426,14 @@ def _error_violations(manifest: Manifest) -> Iterator[RuleViolation]:
     having = sum(node.errors is not None for _, _, node in regions)
     says = manifest.head.get("lodErrors")
     if 0 < having < len(regions):
-        text = f"{having:,} of {count_of(len(regions), 'region')} have errors"
-        yield broken("lod-errors", text, fatal=False)
+        yield broken("lod-errors", f"{having:,} of {count_of(len(regions), 'region')} have errors")
     elif bool(having) != bool(says):
         text = f"lodErrors is {quoted_value(says)}, but {'all' if having else 'no'} regions have errors"
-        yield broken("lod-errors", text, fatal=False)
+        yield broken("lod-errors", text)
 
 
 def _wrong_errors(errors: Any, runs: Mapping[int, Run], levels: int) -> tuple[str, bool] | None:
-    """Return what is wrong with the errors of a region, and if that is fatal. Levels without splats do not count."""
+    """Return what is wrong with the errors of a region, and whether it is fatal; ignores levels without splats."""
     if not isinstance(errors, list) or len(errors) != levels:
         return f"not one for each of {count_of(levels, 'level')}", True
     if not all(type(each) in (int, float) and math.isfinite(each) and each >= 0 for each in errors):
@@ -451,27 +444,23 @@ def _wrong_errors(errors: Any, runs: Mapping[int, Run], levels: int) -> tuple[st
     return ("which decrease", False) if held != sorted(held) else None
 
 
-#: Cells along each axis in which the order of a run is looked at; writers sort by as many, or by more.
+#: Cells along each axis by which the order of a run is checked; writers sort by as many, or by more.
 CELLS = 1 << 10
 
-#: Share of a run's splats that may come after one that they precede, since codes move centres into the next cell: in
-#: files of splat-transform it is up to 0.009, in no order at all 0.5. And the least number of them that is told of.
+#: Share of a run's splats that may be out of order, since codes move centres into the next cell: files of
+#: splat-transform have up to 0.009, random orders 0.5; and the largest number that is not reported.
 OUT_OF_ORDER, FEW = 0.05, 16
 
 
 def chunk_files(open_companion: OpenCompanion | None) -> SceneFiles:
-    """Return the SOG scenes beside a manifest, which names the meta.json of each."""
+    """Return the SOG scenes that a manifest names."""
     return SceneFiles(
         open_companion, MANIFEST, "streamed-sog.chunk-files", lambda name, source: sog.open_content(source)
     )
 
 
 def files_of_chunk(open_companion: OpenCompanion, name: str) -> list[str]:
-    """Return the files that a chunk is read from: its meta.json and then its images, or itself where it is bundled.
-
-    Raises:
-        FormatError: it cannot be opened, or is no meta.json.
-    """
+    """Return the files of a chunk: its meta.json and images, or the one bundled file; `FormatError` if unreadable."""
     with open_companion(name) as file:
         data = file.read(MAX_META + 1)
     if data.startswith(ZIP):
@@ -482,7 +471,10 @@ def files_of_chunk(open_companion: OpenCompanion, name: str) -> list[str]:
 def scan_files(
     file: BinaryIO, open_companion: OpenCompanion
 ) -> tuple[Manifest, dict[str, Chunk | str], list[RuleViolation]]:
-    """Read the manifest, each file that it names, or why that cannot be read, and the rules that they break.
+    """Read a manifest and the headers of the files that it names.
+
+    Returns:
+        the manifest; the header of each file by name, or why it cannot be read; and the rules that they break.
 
     Raises:
         FormatError: the manifest cannot be parsed.
@@ -508,7 +500,7 @@ def scan_splats(
     threads: int = 1,
     progress: Progress = silent,
 ) -> Iterator[RuleViolation]:
-    """Yield the rules about splats that chunk files break, see `SceneFiles.violations`."""
+    """Yield the rules that the splats of chunk files break, see `SceneFiles.violations`."""
     runs: dict[str, list[tuple[int, int, Run]]] = {name: [] for name in manifest.filenames}
     for number, held, _ in regions_of(manifest):
         for level, run in held.items():
@@ -516,7 +508,7 @@ def scan_splats(
 
     def broken_by(chunk: Chunk, splats: Splats) -> Iterator[RuleViolation]:
         here = runs[chunk.name]
-        # Those of level 0 are found by the report on the scene, which they are.
+        # The report on the scene, which is level 0, checks the splats of that level itself.
         if any(level for _, level, _ in here) and (unusable := not_finite(chunk, splats)) is not None:
             yield unusable
             return
@@ -527,19 +519,18 @@ def scan_splats(
             bound = manifest.nodes[number].bound
             outside = count_outside(part, np.array(bound), steps) if bound is not None and is_box(bound) else 0
             if outside:
-                text = f"{count_of(outside, 'splat')} of {subject} lie outside of its bound"
-                yield broken("extents", text, fatal=False)
+                yield broken("extents", f"{count_of(outside, 'splat')} of {subject} lie outside of its bound")
             descents = _descents(part.center)
             if descents > max(FEW, OUT_OF_ORDER * run.count):
                 text = f"{descents:,} of {count_of(run.count, 'splat')} of {subject} come after one that they precede"
-                yield broken("order", text, fatal=False)
+                yield broken("order", text)
 
     named = [chunks[name] for name in manifest.filenames if name in chunks]
     return chunk_files(open_companion).violations(named, broken_by, threads, progress)
 
 
 def _descents(center: FloatArray) -> int:
-    """Return how many splats come after one that they precede on the Morton curve."""
+    """Return the number of splats whose predecessor comes after them on the Morton curve."""
     wide = center.astype(np.float64)
     low, extent = wide.min(axis=0, initial=np.inf), np.ptp(wide, axis=0) if len(wide) else 0
     scaled = (wide - low) / np.where(extent > 0, extent, 1) * CELLS

@@ -1,19 +1,19 @@
-"""Tilesets of 3D Tiles as they are read, one file with the nested ones that it names, and their rules.
+"""Tilesets of 3D Tiles, a file with the nested ones that it names, and their rules.
 
-Parsing checks what reading needs; all other rules, of the files, the tiles and their splats, are for reports and for
-the reader. z is up in a tileset and its volumes, y in the glTF content of its tiles, which a viewer turns when it loads
-it: (x, y, z) becomes (x, -z, y). Facts: the specification of 3D Tiles 1.1 (OGC 22-025r4), sections 5 and 6, and "glTF
-transforms".
+Parsing checks what reading needs; all other rules, of the files, the tiles and their splats, are checked apart. z is up
+in a tileset and its volumes, y in the glTF content of its tiles, which a viewer turns when it loads it: (x, y, z)
+becomes (x, -z, y). Facts: the specification of 3D Tiles 1.1 (OGC 22-025r4), sections 5 and 6, and "glTF transforms".
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import posixpath
 import urllib.parse
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ from ..model.splats import Splats
 from ..system.errors import FormatError, UnsupportedError, VersionError
 from ..system.progress import Progress, silent
 from ..system.units import count_of
-from ..system.untrusted import Json, quoted_value
+from ..system.untrusted import quoted_value
 from .format_rules import (
     LOOSE_BOUND,
     RuleViolation,
@@ -42,37 +42,37 @@ from .gltf_container import product, rotation_of_up
 from .merging import Chunk, SceneFiles, not_finite
 from .reader import FileNote, OpenCompanion, read_note
 
-#: The version that is written, and the one before it, which is read, too.
+#: Version that is written, and an older one that is also read.
 VERSION, OLD_VERSION = "1.1", "1.0"
 
-#: How the children of a tile refine it, the one way that is read and written.
+#: Refinement of a tile by its children, the only one that is read and written.
 REPLACE = "REPLACE"
 
-#: The extension that names the extensions of glTF which the tiles use.
+#: Extension that lists the glTF extensions of the tiles.
 CONTENT_GLTF = "3DTILES_content_gltf"
 
-#: Largest tileset file, bytes: that of 100,000 tiles.
+#: Largest tileset file in bytes; fits 100,000 tiles.
 MAX_TILESET = 1 << 25
 
-#: Most tiles, and files of tilesets, of one scene: a hundred thousand tiles hold ten billion splats. Chosen.
+#: Most tiles and tileset files of one scene: a hundred thousand tiles hold ten billion splats. Chosen.
 MAX_TILES, MAX_FILES = 1 << 17, 1 << 12
 
-#: Suffixes of the content of tiles that is read: nested tilesets, and splats.
+#: Suffixes of readable contents of tiles: nested tilesets, and splats.
 NESTED, SPLATS = ".json", (".glb", ".gltf")
 
-#: Keys of a tile for what is not read, and of extensions of tiles.
+#: Keys of a tile for content that is not read.
 UNREAD = ("implicitTiling", "contents")
 
 
 @dataclass(frozen=True)
 class TileRecord:
-    """A tile of a file, not checked.
+    """Unchecked tile of a file.
 
     Attributes:
-        record: its JSON object.
-        uri: of its content; None without.
-        children: numbers of tiles, ascending.
-        parent: number of the tile above, -1 of a root.
+        record: its JSON object without children.
+        uri: address of its content; None without content.
+        children: numbers of the child tiles, ascending.
+        parent: number of the parent, -1 for a root.
         file: path of its tileset file from the folder of the first one on; empty for the first one.
     """
 
@@ -98,13 +98,13 @@ class TileRecord:
 
 @dataclass(frozen=True)
 class Tileset:
-    """Contents of a tileset file, or of one and the nested ones.
+    """Contents of a tileset file and of its nested ones.
 
     Attributes:
         head: everything but the tiles in the first file: "asset", "geometricError", "extensions".
-        tiles: each after its parent; the child of one with a nested tileset is the root of that.
-        heads: `head` of each file, by its path; empty for the first one.
-        bytes: of all files.
+        tiles: all tiles, parents first; the child of a tile with a nested tileset is the root of that tileset.
+        heads: `head` of each file by its path, which is empty for the first file.
+        bytes: size of all files.
     """
 
     head: Mapping[str, Any]
@@ -117,7 +117,7 @@ class Tileset:
         return read_note(self.head["asset"].get("extras"))
 
     def place(self, number: int) -> str:
-        """Return the place of a tile: "root.children[0]", in a nested file with its name before that."""
+        """Return the place of a tile, such as "root.children[0]", after the name of a nested file."""
         file = self.tiles[number].file
 
         def parent_of(each: int) -> int:
@@ -128,39 +128,32 @@ class Tileset:
         return f"{quoted_value(file)} {place}" if file else place
 
     def names(self) -> Iterator[str]:
-        """Yield the files that its tiles name, from its folder on."""
+        """Yield the paths of the contents of tiles, relative to the folder of the first file."""
         return (name for tile in self.tiles if (name := tile.name) is not None)
 
 
 def parse(data: bytes, file: str = "") -> Tileset:
-    """Parse a tileset file, without nested ones; `file` is its path from the folder of the first one on."""
+    """Parse a tileset file without nested ones; `file` is its path from the folder of the first one on."""
     called = quoted_value(file) if file else TILESET
     root = parse_manifest(data, called, MAX_TILESET)
     version = root.get("asset", "version").value
     if version not in (VERSION, OLD_VERSION):
         text = f"3D Tiles version {quoted_value(version)} is unknown, only {OLD_VERSION} and {VERSION}"
         raise VersionError(f"{text} are read")
-    tiles = _tiles(root.get("root"), file)
-    head = {key: value.value for key, value in root.entries() if key != "root"}
-    return Tileset(head, tiles, {file: head}, len(data))
-
-
-def _tiles(root: Json, file: str) -> tuple[TileRecord, ...]:
     tiles = list[TileRecord]()
-    for tile, parent, children in nodes_of(root, MAX_TILES):
+    for tile, parent, children in nodes_of(root.get("root"), MAX_TILES):
         record = {key: value for key, value in tile.value.items() if key != "children" and value is not None}
         uri = tile.text("content", "uri") if "content" in record else None
         tiles.append(TileRecord(record, uri, tuple(children), parent, file))
-    return tuple(tiles)
+    head = {key: value.value for key, value in root.entries() if key != "root"}
+    return Tileset(head, tuple(tiles), {file: head}, len(data))
 
 
 def read_whole(data: bytes, open_companion: OpenCompanion | None) -> Tileset:
-    """Return a tileset with all tiles of the nested ones; errors name nested files that cannot be opened."""
+    """Parse a tileset and all nested ones; errors name nested files that cannot be opened."""
     first = parse(data)
     tiles, heads, size = list(first.tiles), dict(first.heads), first.bytes
-    number = 0
-    while number < len(tiles):
-        tile = tiles[number]
+    for number, tile in enumerate(tiles):  # which grows
         name = tile.name
         if tile.is_nested and name is not None and not tile.children:
             if name in heads or name == TILESET:
@@ -173,12 +166,11 @@ def read_whole(data: bytes, open_companion: OpenCompanion | None) -> Tileset:
             offset = len(tiles)
             if offset + len(inner.tiles) > MAX_TILES:
                 raise FormatError(f"it has more than {MAX_TILES:,} tiles")
-            tiles[number] = TileRecord(tile.record, tile.uri, (offset,), tile.parent, tile.file)
+            tiles[number] = replace(tile, children=(offset,))
             for each in inner.tiles:
                 below = tuple(child + offset for child in each.children)
                 parent = number if each.parent < 0 else each.parent + offset
-                tiles.append(TileRecord(each.record, each.uri, below, parent, name))
-        number += 1
+                tiles.append(replace(each, children=below, parent=parent))
     return Tileset(first.head, tuple(tiles), heads, size)
 
 
@@ -203,10 +195,10 @@ LARGEST = 3.4e38
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """A box or a sphere around (3,) `center`; a box has a radius of 0.
+    """Box or sphere around (3,) `center`; a box has a radius of 0.
 
     Attributes:
-        axes: (3, 3) halves of the sides of a box as rows; (0, 3) of a sphere.
+        axes: (3, 3) half sides of a box as rows; (0, 3) for a sphere.
     """
 
     center: Vector
@@ -214,16 +206,11 @@ class Volume:
     radius: float = 0.0
 
     def reach(self, directions: Vector) -> Vector:
-        """Return (n,) extents from its centre along (n, 3) directions of length 1."""
+        """Return (n,) extents from the centre along (n, 3) unit directions."""
         return np.abs(directions @ self.axes.T).sum(axis=1) + self.radius
 
-    def corners(self) -> Vector:
-        """Return (n, 3) corners of a box."""
-        signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)], np.float64)
-        return self.center + signs @ self.axes
-
     def directions(self) -> Vector:
-        """Return (3, 3) directions of the sides of a box as rows; sides of length 0 get perpendicular directions."""
+        """Return (3, 3) unit directions of the sides of a box as rows, perpendicular ones for sides of length 0."""
         found = list[Vector]()
         for axis in self.axes[np.argsort(-np.linalg.norm(self.axes, axis=1), kind="stable")]:
             length = float(np.linalg.norm(axis))
@@ -236,7 +223,7 @@ class Volume:
         return np.array(found)
 
     def bounds(self) -> Vector:
-        """Return (2, 3) corners of the box along the axes around it."""
+        """Return (2, 3) corners of its axis-aligned bounding box."""
         half = self.reach(np.eye(3))
         return np.stack([self.center - half, self.center + half])
 
@@ -246,10 +233,11 @@ class Volume:
         return Volume(matrix[:3, :3] @ self.center + matrix[:3, 3], self.axes @ matrix[:3, :3].T, scale * self.radius)
 
     def holds(self, other: Volume, loose: float) -> bool:
-        """Return whether another volume is inside, or at most `loose` outside."""
+        """Return whether another volume is inside, or outside by at most `loose`."""
         if not len(self.axes):
             if len(other.axes):
-                far = float(np.linalg.norm(other.corners() - self.center, axis=1).max())
+                corners = other.center + np.array(list(itertools.product((-1.0, 1.0), repeat=3))) @ other.axes
+                far = float(np.linalg.norm(corners - self.center, axis=1).max())
             else:
                 far = float(np.linalg.norm(other.center - self.center)) + other.radius
             return far <= self.radius + loose
@@ -260,19 +248,19 @@ class Volume:
 
     @property
     def size(self) -> float:
-        """Largest number in it, by which rounding is measured."""
+        """Largest coordinate of its bounds, the unit of rounding errors."""
         return float(np.abs(self.center).max() + self.reach(np.eye(3)).max())
 
 
 def volume_of(value: Any) -> Volume | str | None:
-    """Return the volume of a "boundingVolume"; None for a region, whose numbers are angles; a text if it is invalid."""
+    """Parse a "boundingVolume": the volume, None for a region, whose numbers are angles, or what is wrong with it."""
     kind = next((kind for kind in KINDS if isinstance(value, dict) and kind in value), None)
     if kind is None:
         return "none of box, sphere and region"
     numbers = value[kind]
     if not isinstance(numbers, list) or len(numbers) != KINDS[kind]:
         return f"a {kind} that has not {KINDS[kind]} numbers"
-    if not all(type(each) in (int, float) and math.isfinite(each) and abs(each) <= LARGEST for each in numbers):
+    if not all(type(each) in (int, float) and abs(each) <= LARGEST for each in numbers):
         return f"a {kind} with something else than finite numbers"
     found = np.array(numbers, np.float64)
     if kind == "box":
@@ -284,27 +272,30 @@ def volume_of(value: Any) -> Volume | str | None:
     return Volume(found[:3], np.empty((0, 3)), float(found[3]))
 
 
-#: The turn from the axes of glTF to those of tilesets, of column vectors.
+#: Rotation of column vectors from the axes of glTF to those of tilesets.
 Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def to_tileset(up: str | None) -> NDArray[np.float64]:
-    """Return the (3, 3) rotation from the axes of splats in a GLB of ours, of which `up` is up, to the tileset's.
+    """Return the (3, 3) rotation from the axes of splats in a GLB to those of the tileset.
 
     Its entries are 0, 1 and -1, so that boxes stay boxes.
+
+    Args:
+        up: axis of the splats that points up; None for y.
     """
     return Y_TO_Z @ rotation_of_up(up)
 
 
 def turned(bounds: Bounds, rotation: NDArray[np.float64]) -> Bounds:
-    """Return (..., 2, 3) corners of the boxes around boxes turned by a (3, 3) rotation of column vectors."""
+    """Return the (..., 2, 3) corners of the boxes around boxes after a (3, 3) rotation of column vectors."""
     middle, half = bounds.mean(axis=-2), (bounds[..., 1, :] - bounds[..., 0, :]) / 2
     center, reach = middle @ rotation.T, half @ np.abs(rotation).T
     return np.stack([center - reach, center + reach], axis=-2)
 
 
-#: Meaning of each code; the text of a violation has the values. Values of the wrong kind, which the parser refuses,
-#: have the codes "container.corrupt" and "container.version", as in other formats.
+#: Meaning of each code; the text of a violation has the values. Values that the parser refuses have the codes
+#: "container.corrupt" and "container.version", as in other formats.
 ERRORS = {
     "tiles.unread": "a tile has content, or children, of a kind that is not read",
     "tiles.refine": "the children of a tile do not replace it",
@@ -329,19 +320,25 @@ WARNINGS = {
     "tiles.large": "a tile has more splats than a viewer should load at once",
 }
 
-#: Splats of a tile from which on `tiles.large` is told of: ten times what is written unless somebody chooses. Chosen.
+#: Rules that a readable file may break.
+READABLE = {
+    *WARNINGS,
+    *(f"tiles.{name}" for name in ("required", "inside", "extents", "unrefined", "sh", "extensions")),
+}
+broken = functools.partial(violation, READABLE, "tiles")
+
+#: Largest number of splats of a tile without `tiles.large`, ten times the default of tiles that are written. Chosen.
 LARGE = 1_000_000
 
-#: By how much a bounding volume may be outside of that of its parent, as a share of its largest number.
+#: Allowed distance of a bounding volume outside that of its parent, as a share of its largest number.
 ROUNDING = 1e-5
 
-#: The extensions by which a tile is splats, see `gltf`.
+#: Extensions of glTF that mark a tile as splats, see `gltf`.
 SPLAT_EXTENSIONS = (EXTENSION, COMPRESSION)
-broken = functools.partial(violation, "tiles")
 
 
 def read_violations(tileset: Tileset) -> Iterator[RuleViolation]:
-    """Yield the broken rules without which the splats of its tiles cannot be read."""
+    """Yield the broken rules that keep the splats of a tileset from being read."""
     for name, head in tileset.heads.items():
         required = head.get("extensionsRequired", [])
         others = [each for each in required if each != CONTENT_GLTF] if isinstance(required, list) else [required]
@@ -360,9 +357,8 @@ def _unread(tileset: Tileset, number: int, tile: TileRecord) -> Iterator[RuleVio
     extensions = tile.record.get("extensions")
     implicit = isinstance(extensions, dict) and "3DTILES_implicit_tiling" in extensions
     for key in (*(each for each in UNREAD if each in tile.record), *(["implicit tiling"] if implicit else [])):
-        yield broken(
-            "unread", f"{tileset.place(number)} has {key}, which is not read; only tiles listed one by one are"
-        )
+        text = f"{tileset.place(number)} has {key}, which is not read; only tiles listed one by one are"
+        yield broken("unread", text)
     refine = tile.record.get("refine", REPLACE)
     if refine != REPLACE:
         yield broken("refine", f"{tileset.place(number)} has refine {quoted_value(refine)}; only {REPLACE} is read")
@@ -371,9 +367,8 @@ def _unread(tileset: Tileset, number: int, tile: TileRecord) -> Iterator[RuleVio
         text = f"{tileset.place(number)} has the content {quoted_value(tile.uri)}, which is not a file below its folder"
         yield broken("files", text)
     elif name is not None and not tile.is_nested and posixpath.splitext(name)[1].lower() not in SPLATS:
-        text = f"{tileset.place(number)} has the content {quoted_value(tile.uri)}; only"
-        text += f" {', '.join(SPLATS)} and tilesets are read"
-        yield broken("unread", text)
+        text = f"{tileset.place(number)} has the content {quoted_value(tile.uri)}"
+        yield broken("unread", f"{text}; only {', '.join(SPLATS)} and tilesets are read")
     elif tile.is_nested and (len(tile.children) != 1 or tileset.tiles[tile.children[0]].file == tile.file):
         text = f"{tileset.place(number)} has a nested tileset and children beside it, which is not read"
         yield broken("unread", text)
@@ -383,7 +378,7 @@ def _unread(tileset: Tileset, number: int, tile: TileRecord) -> Iterator[RuleVio
 
 
 def _numbers(record: Mapping[str, object]) -> list[float] | None:
-    """Return the numbers of a transform; None where it is none."""
+    """Return the numbers of the "transform" of a tile; None if they are invalid or missing."""
     numbers = record.get("transform")
     if not isinstance(numbers, list) or len(numbers) != 16:
         return None
@@ -393,13 +388,13 @@ def _numbers(record: Mapping[str, object]) -> list[float] | None:
 
 
 def matrix_of(record: Mapping[str, object]) -> NDArray[np.float64]:
-    """Return the (4, 4) transform of a tile, the identity unless it has one, for column vectors."""
+    """Return the (4, 4) transform of a tile for column vectors, by default the identity."""
     numbers = _numbers(record)
     return np.eye(4) if numbers is None else np.array(numbers, np.float64).reshape(4, 4).T
 
 
 def matrices_of(tileset: Tileset, *, of_root: bool = False) -> list[NDArray[np.float64]]:
-    """Return the (4, 4) transform of each tile to the axes of the tileset, with that of the root if `of_root`."""
+    """Return the (4, 4) transform of each tile to the axes of the tileset; `of_root` includes that of the root."""
     matrices = list[NDArray[np.float64]]()
     for number, tile in enumerate(tileset.tiles):
         matrix = matrices[tile.parent] if tile.parent >= 0 else np.eye(4)
@@ -413,7 +408,7 @@ def matrices_of(tileset: Tileset, *, of_root: bool = False) -> list[NDArray[np.f
 
 
 def depths_of(tileset: Tileset) -> list[int]:
-    """Return the edges from the root to each tile; one that stands for a nested tileset has the depth of its root."""
+    """Return the depth of each tile; a tile with a nested tileset has the depth of the nested root."""
     depths = list[int]()
     for tile in tileset.tiles:
         above = None if tile.parent < 0 else tileset.tiles[tile.parent]
@@ -422,7 +417,7 @@ def depths_of(tileset: Tileset) -> list[int]:
 
 
 def volumes_of(tileset: Tileset) -> list[Volume | str | None]:
-    """Return the bounding volume of each tile in the axes of the tileset; as `volume_of` where it has none."""
+    """Return the bounding volume of each tile in the axes of the tileset, or the other results of `volume_of`."""
     volumes = (volume_of(tile.record.get("boundingVolume")) for tile in tileset.tiles)
     return [
         volume.moved(matrix) if isinstance(volume, Volume) else volume
@@ -431,7 +426,7 @@ def volumes_of(tileset: Tileset) -> list[Volume | str | None]:
 
 
 def violations(tileset: Tileset) -> Iterator[RuleViolation]:
-    """Yield the broken rules of the tileset files, but for `read_violations`."""
+    """Yield the rules that tileset files break, apart from `read_violations`."""
     yield from _heads(tileset)
     yield from _volumes(tileset)
     yield from _errors(tileset)
@@ -442,7 +437,7 @@ def violations(tileset: Tileset) -> Iterator[RuleViolation]:
             yield broken("shared", f"{tileset.place(number)} has the file {quoted_value(name)}, as a tile before it")
         seen |= set() if name is None else {name}
         if name is None and not tile.children:
-            yield broken("empty", f"{tileset.place(number)} has neither children nor content", fatal=False)
+            yield broken("empty", f"{tileset.place(number)} has neither children nor content")
 
 
 def _heads(tileset: Tileset) -> Iterator[RuleViolation]:
@@ -450,14 +445,14 @@ def _heads(tileset: Tileset) -> Iterator[RuleViolation]:
         where = f"{quoted_value(name)} " if name else ""
         version, error = head["asset"].get("version"), head.get("geometricError")
         if version == OLD_VERSION:
-            yield broken("old", f"{where}has the version {OLD_VERSION}, not {VERSION}", fatal=False)
+            yield broken("old", f"{where}has the version {OLD_VERSION}, not {VERSION}")
         if _number(error) is None:
             text = f"the geometricError of {where or 'the tileset '}is {quoted_value(error)}, not a number from 0 on"
-            yield broken("required", text, fatal=False)
+            yield broken("required", text)
     for number, tile in enumerate(tileset.tiles):
         is_root = tile.parent < 0 or tileset.tiles[tile.parent].file != tile.file
         if is_root and "refine" not in tile.record:
-            yield broken("required", f"{tileset.place(number)} has no refine, which a root must have", fatal=False)
+            yield broken("required", f"{tileset.place(number)} has no refine, which a root must have")
     root, error = (_number(each.get("geometricError")) for each in (tileset.tiles[0].record, tileset.head))
     if root is not None and error is not None and root > error * (1 + ROUNDING):
         text = f"the geometricError of root is {root:g}, more than that of the tileset, {error:g}"
@@ -465,7 +460,7 @@ def _heads(tileset: Tileset) -> Iterator[RuleViolation]:
 
 
 def _number(value: object) -> float | None:
-    """Return a geometric error; None where it is no finite number from 0 on."""
+    """Return a geometric error; None if it is not a finite number from 0 on."""
     is_error = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value >= 0
     return float(value) if is_error else None  # type: ignore[arg-type]
 
@@ -479,8 +474,7 @@ def _volumes(tileset: Tileset) -> Iterator[RuleViolation]:
         above = volumes[tile.parent] if tile.parent >= 0 else None
         if own is None or not isinstance(above, Volume) or above.holds(own, ROUNDING * max(own.size, above.size)):
             continue
-        text = f"the bounding volume of {tileset.place(number)} reaches out of that of the tile above"
-        yield broken("inside", text, fatal=False)
+        yield broken("inside", f"the bounding volume of {tileset.place(number)} reaches out of that of the tile above")
 
 
 def _errors(tileset: Tileset) -> Iterator[RuleViolation]:
@@ -494,14 +488,14 @@ def _errors(tileset: Tileset) -> Iterator[RuleViolation]:
         if above is not None and error > above * (1 + ROUNDING):
             yield broken("errors", f"{place} is {error:g}, more than that of the tile above, {above:g}", fatal=False)
         if not tile.children and error:
-            yield broken("leaf-error", f"{place} is {error:g}, but it has no children", fatal=False)
-        # A tile that stands for a nested tileset, as one without splats, is refined whatever its error is.
+            yield broken("leaf-error", f"{place} is {error:g}, but it has no children")
+        # A tile with a nested tileset, or without splats, is refined whatever its error is.
         if tile.children and not error and tile.uri is not None and not tile.is_nested:
-            yield broken("unrefined", f"{place} is 0, but it has children", fatal=False)
+            yield broken("unrefined", f"{place} is 0, but it has children")
 
 
 def scan_files(tileset: Tileset, files: SceneFiles) -> tuple[dict[int, Chunk], list[RuleViolation]]:
-    """Read the header of each tile; return those that can be read, by the number of the tile, and the broken rules."""
+    """Read the header of each tile; return the readable ones by the number of the tile, and the broken rules."""
     chunks, found = dict[int, Chunk](), list[RuleViolation]()
     for number, tile in enumerate(tileset.tiles):
         name = tile.name
@@ -523,23 +517,22 @@ def _kinds(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Iterator[RuleViolat
     for chunk in chunks.values():
         if chunk.sh_degree != first.sh_degree:
             text = f"{quoted_value(chunk.name)} has SH degree {chunk.sh_degree}; the first tile has {first.sh_degree}"
-            yield broken("sh", text, fatal=False)
+            yield broken("sh", text)
         if chunk.up != first.up:
             text = f"{quoted_value(chunk.name)} has {_up(chunk)}; the first tile has {_up(first)}"
             yield broken("kind", text)
-    # GLBs with an SPZ inside are told by their format, see `gltf`.
+    # The name of the format says whether there is an SPZ in a GLB, see `gltf`.
     needed = SPLAT_EXTENSIONS if any("SPZ" in chunk.format for chunk in chunks.values()) else SPLAT_EXTENSIONS[:1]
     for name, head in tileset.heads.items():
         where = f"{quoted_value(name)} does not list" if name else "it does not list"
         if CONTENT_GLTF not in _list(head.get("extensionsUsed")):
-            yield broken("extensions", f"{where} {CONTENT_GLTF} in extensionsUsed", fatal=False)
+            yield broken("extensions", f"{where} {CONTENT_GLTF} in extensionsUsed")
         extensions = head.get("extensions")
         held = extensions.get(CONTENT_GLTF) if isinstance(extensions, dict) else None
         for key in ("extensionsUsed", "extensionsRequired"):
             missing = [each for each in needed if each not in _list(held.get(key) if isinstance(held, dict) else None)]
             if missing:
-                text = f"{where} {' and '.join(missing)} in {key} of {CONTENT_GLTF}"
-                yield broken("extensions", text, fatal=False)
+                yield broken("extensions", f"{where} {' and '.join(missing)} in {key} of {CONTENT_GLTF}")
 
 
 def _up(chunk: Chunk) -> str:
@@ -554,17 +547,17 @@ def _counts(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Iterator[RuleViola
     for number, chunk in chunks.items():
         if chunk.count > LARGE:
             text = f"{quoted_value(chunk.name)} has {count_of(chunk.count, 'splat')}, more than {LARGE:,}"
-            yield broken("large", f"{text}, which take long to load", fatal=False)
+            yield broken("large", f"{text}, which take long to load")
         below = [_stands_for(tileset, child) for child in tileset.tiles[number].children]
         if below and all(child in chunks for child in below):
             total = sum(chunks[child].count for child in below)
             if total < chunk.count:
                 text = f"the children of {tileset.place(number)} have {count_of(total, 'splat')}"
-                yield broken("decreasing", f"{text}, and it has {chunk.count:,}", fatal=False)
+                yield broken("decreasing", f"{text}, and it has {chunk.count:,}")
 
 
 def _stands_for(tileset: Tileset, number: int) -> int:
-    """Return the root of a nested tileset for the tile that stands for it, else the tile."""
+    """Return the root of its nested tileset for a tile that has one, else the tile itself."""
     while tileset.tiles[number].is_nested and tileset.tiles[number].children:
         (number,) = tileset.tiles[number].children
     return number
@@ -573,7 +566,7 @@ def _stands_for(tileset: Tileset, number: int) -> int:
 def scan_splats(
     tileset: Tileset, files: SceneFiles, chunks: Mapping[int, Chunk], *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[RuleViolation]:
-    """Yield the rules about splats that tiles, by number, break; see `SceneFiles.violations`."""
+    """Yield the rules that the splats of tiles break; `chunks` are by tile number, see `SceneFiles.violations`."""
     volumes, numbers = volumes_of(tileset), {chunk.name: number for number, chunk in chunks.items()}
 
     def broken_by(chunk: Chunk, splats: Splats) -> Iterator[RuleViolation]:
@@ -583,14 +576,13 @@ def scan_splats(
         volume, place = volumes[numbers[chunk.name]], tileset.place(numbers[chunk.name])
         outside = _outside(splats, volume, to_tileset(chunk.up)) if isinstance(volume, Volume) else 0
         if outside:
-            text = f"{count_of(outside, 'splat')} of {place} lie outside of its bounding volume"
-            yield broken("extents", text, fatal=False)
+            yield broken("extents", f"{count_of(outside, 'splat')} of {place} lie outside of its bounding volume")
 
     return files.violations(list(chunks.values()), broken_by, threads, progress)
 
 
 def _outside(splats: Splats, volume: Volume, rotation: NDArray[np.float64]) -> int:
-    """Count splats outside of a volume; `rotation` is (3, 3), from the axes of the splats to those of the volume."""
+    """Count the splats outside of a volume; `rotation` is (3, 3), from their axes to those of the volume."""
     if not len(volume.axes):
         far = np.linalg.norm(splats.center @ rotation.T - volume.center, axis=1)
         return int(np.count_nonzero(far > volume.radius * (1 + LOOSE_BOUND)))

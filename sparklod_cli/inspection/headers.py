@@ -15,7 +15,7 @@ from ..codecs.format_rules import RuleViolation
 from ..codecs.merging import Chunk
 from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16
 from ..codecs.rad.rad_header import RadChunkHeader, RadHeader, encoding_fields
-from ..codecs.rad.rad_reader import scan_chunks, scan_header
+from ..codecs.rad.rad_reader import RadReader, scan_header
 from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.spark_codings import log_scale_table
 from ..codecs.streamed_manifest import VERSION as STREAMED_SOG_VERSION
@@ -135,7 +135,7 @@ def survey_rad(file: BinaryIO, open_companion: OpenCompanion, *, check: bool) ->
     header, violations = scan_header(file, open_companion)
     chunks: list[RadChunkHeader] = []
     if not any(each.fatal for each in violations):
-        for chunk, broken in scan_chunks(file, open_companion, header, paddings=check):
+        for chunk, broken in RadReader(header, file, open_companion).scan_chunks(paddings=check):
             violations += broken
             chunks += [] if chunk is None else [chunk]
     if any(each.fatal for each in violations):

@@ -27,7 +27,7 @@ from ..codecs.gltf import open_content as open_glb
 from ..codecs.gltf_container import MAGIC as GLB_MAGIC
 from ..codecs.losses import MOST_PAGED_DEGREE, sample_loss
 from ..codecs.rad.rad_header import CHUNK_MAGIC, MAGIC, RadHeader, read_header
-from ..codecs.rad.rad_reader import count_leaves, file_of, read_chunk
+from ..codecs.rad.rad_reader import RadReader
 from ..codecs.reader import OpenFile
 from ..codecs.streamed_manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..codecs.tiles_3d import names_of
@@ -340,11 +340,9 @@ def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
     def opened(name: str) -> BinaryIO:
         return open_plain(companions[name])
 
-    entry = header.chunks[0]
     with opened(shown.path.name) as file:
-        with file_of(entry, file, opened) as first:
-            chunk = read_chunk(first, entry, header)
-        leaves = count_leaves(file, header, opened)
+        reader = RadReader(header, file, opened)
+        chunk, leaves = reader.read_chunk(0), reader.count_leaves()
     assert chunk.tree is not None
     start, count = (column.astype(np.int64) for column in (chunk.tree.child_start, chunk.tree.child_count))
     cut = np.flatnonzero((count == 0) | (start + count > len(chunk.splats)))

@@ -24,7 +24,7 @@ from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.property_codings import CODINGS
 from sparklod_cli.codecs.rad.rad_header import read_header
-from sparklod_cli.codecs.rad.rad_reader import read_chunk
+from sparklod_cli.codecs.rad.rad_reader import RadReader
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.codecs.statistics import SMALL_QUANTILE, STEPS_A_SPLAT, Statistics
 from sparklod_cli.io.reading import read_scene
@@ -160,7 +160,7 @@ def test_reading_a_chunk_reads_only_its_own_bytes() -> None:
     assert (header.bytes, len(header.chunks), header.comment) == (min(set(range(9999)) - file.touched), 3, "by hand")
     for number, entry in enumerate(header.chunks):
         file.touched.clear()
-        chunk = read_chunk(file, entry, header)
+        chunk = RadReader(header, file).read_chunk(number)
         start = header.bytes + entry.offset
         assert file.touched == set(range(start, start + entry.bytes))
         rows = slice(24 * number, 24 * number + chunk.header.count)
@@ -173,14 +173,15 @@ def test_a_chunk_with_labels_needs_the_palette_of_the_first_chunk() -> None:
     scene = read_scene(CHUNKED)
     with CHUNKED.open("rb") as file:
         header = read_header(file)
-    files = [io.BytesIO((CHUNKED.parent / str(entry.filename)).read_bytes()) for entry in header.chunks]
-    first, second = (read_chunk(file, entry, header) for file, entry in zip(files[:2], header.chunks, strict=False))
+        reader = RadReader(header, file, lambda name: (CHUNKED.parent / name).open("rb"))
+        first, second = (reader.read_chunk(number) for number in (0, 1))
+        again = dataclasses.replace(reader, palette=first.palette).read_chunk(1)
     assert first.palette is not None and first.labels is None and second.palette is None
     assert_same(first.splats, scene.splats.take(slice(24)))
     assert second.labels is not None and not second.splats.sh.any()
     rows = scene.splats.take(slice(24, 48))
     np.testing.assert_array_equal(first.palette[second.labels], rows.sh)
-    assert_same(read_chunk(files[1], header.chunks[1], header, first.palette).splats, rows)
+    assert_same(again.splats, rows)
     assert scene.header["sh_codes"] == 24 and scene.header["chunked"] == 1
 
 
@@ -310,7 +311,7 @@ def test_a_palette_is_padded_to_the_splats_of_the_first_chunk(few_sh: Scene) -> 
     """Spark reads no other number of codes, see docs/formats/rad.md."""
     file = io.BytesIO(written(few_sh, sh_codes=64))
     header = read_header(file)
-    palette = read_chunk(file, header.chunks[0], header).palette
+    palette = RadReader(header, file).read_chunk(0).palette
     assert palette is not None
     assert header.sh_code_count == len(palette) == 500
     assert palette[:40].any(axis=(1, 2)).all() and not palette[40:].any()
@@ -562,7 +563,7 @@ def test_a_header_that_promises_too_much_is_refused_before_memory_is_allocated(c
     file = io.BytesIO(data)
     known = read_header(file)
     with pytest.raises(PromiseError, match="more than a file of"):
-        read_chunk(file, known.chunks[0], known)
+        RadReader(known, file).read_chunk(0)
     assert tracemalloc.get_traced_memory()[1] < 2e6
     tracemalloc.stop()
 
@@ -574,7 +575,7 @@ def test_a_chunk_that_ends_beyond_its_file_is_refused() -> None:
     file = io.BytesIO(data)
     known = read_header(file)
     with pytest.raises(FormatError, match="cut short"):
-        read_chunk(file, known.chunks[0], known)
+        RadReader(known, file).read_chunk(0)
     with pytest.raises(FormatError, match=r"cut short|inside"):
         decode(rad, data)
 

@@ -27,7 +27,7 @@ from sparklod_cli.codecs import ext_splats, packed_splats, spark_nodes, spz
 from sparklod_cli.codecs.options import DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
-from sparklod_cli.codecs.rad.rad_reader import read_chunk
+from sparklod_cli.codecs.rad.rad_reader import RadReader
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality, quick
@@ -224,10 +224,10 @@ def chunks_of(path: Path) -> Iterator[tuple[bytes, Scene, FloatArray | None]]:
     """Yield the bytes of each chunk of a file, what sparklod reads of it alone, and its part of the palette."""
     header = header_of(path)
     palette = None
-    for entry in header.chunks:
+    for number, entry in enumerate(header.chunks):
         where = path if entry.filename is None else path.with_name(entry.filename)
-        with where.open("rb") as file:
-            chunk = read_chunk(file, entry, header, palette)
+        with path.open("rb") as file:
+            chunk = RadReader(header, file, lambda name: path.with_name(name).open("rb"), palette).read_chunk(number)
         palette = palette if palette is not None else chunk.palette
         start = entry.start(header)
         yield where.read_bytes()[start : start + entry.bytes], Scene(chunk.splats, chunk.tree), chunk.palette

@@ -1,8 +1,8 @@
 """The headers of RAD files and of their chunks: JSON between a magic word and the bytes that it describes.
 
 A file is a header and its chunks, one after the other; or a header alone that names a file for each chunk. Every chunk
-has a header of its own, so that it can be decoded by itself. `docs/formats/rad.md` lays both out. One list has the
-rules for headers, for reports and for readers, which stop at a fatal violation.
+has a header of its own, so that it can be decoded by itself. `docs/formats/rad.md` describes both. Reports list all
+violations of the rules for headers; readers stop at a fatal one.
 """
 
 from __future__ import annotations
@@ -28,23 +28,24 @@ from ..reader import FileNote, read_comment
 from ..spark_codings import SplatEncoding
 from .property_codings import BY_NAME, CODINGS, GZ, PROPERTIES, Property, Row
 
-#: The first bytes of a file, and of a chunk.
+#: First bytes of a file, and of a chunk.
 MAGIC, CHUNK_MAGIC = b"RAD0", b"RADC"
 
-#: Magic and bytes of the JSON, after which zeros pad the header to `ALIGNMENT`; payload bytes, after a chunk's header.
+#: Magic word and length of the JSON, which zeros pad to `ALIGNMENT`; length of the payload, at the end of a chunk's
+#: header.
 PREFIX, PAYLOAD = struct.Struct("<4sI"), struct.Struct("<Q")
 ALIGNMENT = 8
 
 VERSION, TYPE = 1, "gsplat"
 
-#: Largest JSON of a file, and of a chunk, in bytes. An entry of a chunk takes 50 to 100 bytes, so that a file of
-#: 10,000 chunks, 655 million nodes, has a JSON of 1 MB; a chunk's has about 1,500 bytes.
+#: Largest JSON of a file, and of a chunk, in bytes. The entry of a chunk takes 50 to 100 bytes, so that the JSON of
+#: 10,000 chunks, 655 million nodes, has 1 MB; that of a chunk has about 1,500 bytes.
 MAX_JSON, MAX_CHUNK_JSON = 1 << 24, 1 << 20
 
-#: The name and the content of each file; the header is the last.
+#: Name and content of each file; the header comes last.
 Files = Iterator[tuple[str, Iterable[bytes]]]
 
-#: Keys of "splatEncoding", and the fields of `SplatEncoding` that they fill.
+#: Fields of `SplatEncoding` by their keys in "splatEncoding".
 ENCODING_KEYS = {
     "rgbMin": "rgb_min",
     "rgbMax": "rgb_max",
@@ -59,27 +60,27 @@ ENCODING_KEYS = {
 
 @dataclass(frozen=True)
 class RadChunkEntry:
-    """Place of a chunk, header included: its `offset` is from the first byte after the header, or in its own file."""
+    """Place of a chunk with its header; `offset` counts from the end of the file's header, or in the chunk's file."""
 
     offset: int
     bytes: int
     filename: str | None = None
 
     def start(self, header: RadHeader) -> int:
-        """Return where the chunk begins in the file that has it."""
+        """Return the position of the chunk in its file."""
         return self.offset + (header.bytes if self.filename is None else 0)
 
 
 @dataclass(frozen=True)
 class RadHeader:
-    """The header of a file.
+    """Header of a file.
 
     Attributes:
-        count: splats, which are the nodes if there is a tree.
-        chunk_size: splats of each chunk but the last.
+        count: number of splats; with a tree, of nodes.
+        chunk_size: number of splats of each chunk but the last.
         encoding: ranges of the codes.
-        sh_code_count: entries of the SH palette.
-        bytes: of the header with its padding, after which the first chunk begins.
+        sh_code_count: number of entries of the SH palette.
+        bytes: size of the header with its padding; the first chunk follows.
     """
 
     count: int
@@ -96,34 +97,33 @@ class RadHeader:
 
     @property
     def filenames(self) -> tuple[str, ...]:
-        """Names of the files that chunks have of their own, each once."""
+        """Names of the chunk files, without repetition."""
         return tuple(dict.fromkeys(entry.filename for entry in self.chunks if entry.filename is not None))
 
     @property
     def format(self) -> str:
-        """Name of the format, see `Scene.format`."""
+        """Name of the format, as in `Scene.format`."""
         return "RAD" + " LoD" * self.lod_tree
 
     @property
     def chunked(self) -> bool:
-        """Whether the chunks are files of their own."""
+        """Whether the chunks are in files of their own."""
         return bool(self.filenames)
 
     @functools.cached_property
     def noted(self) -> FileNote:
-        """Note of sparklod in the comment."""
         return read_comment(self.comment)
 
 
 @dataclass(frozen=True)
 class RadChunkHeader:
-    """The header of a chunk.
+    """Header of a chunk.
 
     Attributes:
         base: index of its first splat in the file.
-        payload_bytes: of its properties with their padding, in the JSON.
-        stored_payload_bytes: the same number before the payload.
-        bytes: of the header with its padding and the size of the payload, after which the payload begins.
+        payload_bytes: size of its padded properties, as the JSON says.
+        stored_payload_bytes: the same size, as the bytes before the payload say.
+        bytes: size of the padded header with the length of the payload; the payload follows.
     """
 
     base: int
@@ -139,12 +139,12 @@ class RadChunkHeader:
 
 
 def padding(size: int) -> int:
-    """Return the number of zeros after `size` bytes."""
+    """Return the number of zeros that follow `size` bytes."""
     return -size % ALIGNMENT
 
 
 def read_header(file: BinaryIO) -> RadHeader:
-    """Read the header of a file, up to its first chunk; its promises are checked by `header_violations`."""
+    """Read the header of a file; `header_violations` checks what it says."""
     fields, size, zeros = _read_json(file, MAGIC, MAX_JSON, "RAD header")
     if fields.text("type") != TYPE:
         raise NotSplatsError(f"a RAD file of {quoted_value(fields.text('type'))}, not of {TYPE}")
@@ -169,7 +169,7 @@ def read_header(file: BinaryIO) -> RadHeader:
 
 
 def read_chunk_header(file: BinaryIO) -> RadChunkHeader:
-    """Read the header of a chunk, up to its payload."""
+    """Read the header of a chunk; `chunk_violations` checks what it says."""
     fields, size, zeros = _read_json(file, CHUNK_MAGIC, MAX_CHUNK_JSON, "header of a RAD chunk")
     stored = file.read(PAYLOAD.size)
     if len(stored) < PAYLOAD.size:
@@ -201,8 +201,7 @@ def read_chunk_header(file: BinaryIO) -> RadChunkHeader:
 
 
 def pack_header(header: RadHeader) -> bytes:
-    """Return the bytes of a file's header, padding included; its `bytes` and `padded_with_zeros` are ignored."""
-    chunks = [_present(**vars(each)) for each in header.chunks]
+    """Encode the header of a file with its padding; `bytes` and `padded_with_zeros` are ignored."""
     fields = {
         "version": VERSION,
         "type": TYPE,
@@ -211,7 +210,7 @@ def pack_header(header: RadHeader) -> bytes:
         "lodTree": header.lod_tree or None,
         "chunkSize": header.chunk_size,
         "allChunkBytes": header.all_chunk_bytes,
-        "chunks": chunks,
+        "chunks": [_present(vars(each)) for each in header.chunks],
         "splatEncoding": encoding_fields(header.encoding),
         "shCodeCount": header.sh_code_count,
         "comment": header.comment,
@@ -220,9 +219,9 @@ def pack_header(header: RadHeader) -> bytes:
 
 
 def pack_chunk_header(header: RadChunkHeader) -> bytes:
-    """Return the bytes of a chunk's header up to its payload; the fields about what was read are ignored."""
+    """Encode the header of a chunk; the fields after `encoding`, which describe a file that was read, are ignored."""
     properties = [
-        _present(**{"property" if key == "name" else key: value for key, value in vars(each).items()})
+        _present({"property" if key == "name" else key: value for key, value in vars(each).items()})
         for each in header.properties
     ]
     fields = {
@@ -238,22 +237,22 @@ def pack_chunk_header(header: RadChunkHeader) -> bytes:
     return _pack_json(CHUNK_MAGIC, fields) + PAYLOAD.pack(header.payload_bytes)
 
 
-def _present(**fields: Any) -> dict[str, Any]:
+def _present(fields: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if value is not None}
 
 
 def _pack_json(magic: bytes, fields: dict[str, Any]) -> bytes:
-    data = json.dumps(_present(**fields), separators=(",", ":")).encode()
+    data = json.dumps(_present(fields), separators=(",", ":")).encode()
     return PREFIX.pack(magic, len(data)) + data + bytes(padding(len(data)))
 
 
 def encoding_fields(encoding: SplatEncoding | None) -> dict[str, float | bool] | None:
-    """Return "splatEncoding" of a header; None without ranges."""
+    """Return the "splatEncoding" of a header; None without ranges."""
     return None if encoding is None else {key: getattr(encoding, name) for key, name in ENCODING_KEYS.items()}
 
 
 def _read_json(file: BinaryIO, magic: bytes, limit: int, subject: str) -> tuple[Json, int, bool]:
-    """Read the JSON after a magic word; also return its bytes with the padding, and whether that is zeros."""
+    """Return the JSON after a magic word, the number of bytes read, and whether the padding is zeros."""
     prefix = file.read(PREFIX.size)
     if len(prefix) < PREFIX.size:
         raise TruncatedError(f"cut short inside the {subject}")
@@ -275,7 +274,7 @@ def _read_json(file: BinaryIO, magic: bytes, limit: int, subject: str) -> tuple[
 
 
 def _encoding(fields: Json) -> SplatEncoding | None:
-    """Return the ranges of the codes, if the header has them; missing ones are Spark's defaults."""
+    """Return the ranges of the codes, None if the header has none; single missing ranges are Spark's defaults."""
     if not fields.has("splatEncoding"):
         return None
     given: dict[str, Any] = {
@@ -290,13 +289,13 @@ def _encoding(fields: Json) -> SplatEncoding | None:
 
 
 def in_one_file(header: RadHeader, sizes: Sequence[int], chunks: Iterable[bytes]) -> Iterator[bytes]:
-    """Return the bytes of one file, piece by piece."""
+    """Yield the bytes of one file with all chunks, of these `sizes`."""
     yield _packed(header, map(RadChunkEntry, itertools.accumulate(sizes, initial=0), sizes))
     yield from chunks
 
 
 def in_files(header: RadHeader, chunks: Iterable[bytes], stem: str) -> Files:
-    """Return the files of a scene with a file a chunk, "stem-0.radc" and so on, and the header, "stem.rad"."""
+    """Yield a file for each chunk, "stem-0.radc" and so on, and then the header, "stem.rad"."""
     entries = list[RadChunkEntry]()
     for number, chunk in enumerate(chunks):
         entries.append(RadChunkEntry(0, len(chunk), rad_chunk_name(stem, number)))
@@ -310,8 +309,8 @@ def _packed(header: RadHeader, entries: Iterable[RadChunkEntry]) -> bytes:
     return pack_header(dataclasses.replace(header, chunks=chunks, all_chunk_bytes=size))
 
 
-#: Meaning of each code; the text of a violation has the values. Other formats break some of
-#: these rules, too: their codes are "container.cut-short", "container.trailing" and "container.version".
+#: Meaning of each code; the text of a violation has the values. Violations that all formats share have the codes
+#: "container.cut-short", "container.trailing" and "container.version".
 ERRORS = {
     "rad.chunks": "the number of chunks, or their size, does not fit the number of splats",
     "rad.offsets": "chunks or properties do not lie one after the other",
@@ -335,69 +334,62 @@ WARNINGS = {
     "rad.opacity": "splatEncoding does not mark the opacities of a tree as such",
 }
 
-#: Bytes of a file in which Spark looks for the header at first, and at most.
+#: Rules that a readable file may break.
+READABLE = {*WARNINGS, "rad.header-limit", "rad.kind"}
+broken = functools.partial(violation, READABLE, "rad")
+
+#: Bytes that Spark reads first to find the header, and at most.
 FIRST_LOOK, LAST_LOOK = 1 << 16, 1 << 20
-broken = functools.partial(violation, "rad")
 
 
 def expected_count(header: RadHeader, number: int) -> int:
-    """Return how many splats a chunk has."""
+    """Return the number of splats of a chunk."""
     return max(0, min(header.chunk_size, header.count - number * header.chunk_size))
 
 
 def header_violations(
     header: RadHeader, file_size: int | None = None, files: Mapping[str, int | str] | None = None
 ) -> Iterator[RuleViolation]:
-    """Yield the broken rules of a file's header.
+    """Yield the rules that the header of a file breaks.
 
     Args:
-        file_size: bytes of the file that it was read from; without, nothing is said about where its chunks are.
-        files: sizes of the files that it names for chunks, or why one cannot be opened. Without, they are not looked
-            at.
+        file_size: size of the file in bytes; None to leave the places of chunks unchecked.
+        files: size in bytes of each chunk file by name, or why it cannot be opened; None to leave them unchecked.
     """
     if header.bytes > LAST_LOOK:
-        text = f"its header has {header.bytes:,} bytes; Spark pages files with at most {LAST_LOOK:,}"
-        yield broken("header-limit", text, fatal=False)
+        yield broken("header-limit", f"its header has {header.bytes:,} bytes; Spark pages at most {LAST_LOOK:,}")
     elif header.bytes > FIRST_LOOK:
-        text = f"its header has {header.bytes:,} bytes; Spark asks for {FIRST_LOOK:,} at first"
-        yield broken("header-large", text, fatal=False)
+        yield broken("header-large", f"its header has {header.bytes:,} bytes; Spark asks for {FIRST_LOOK:,} at first")
     wanted = -(-header.count // max(header.chunk_size, 1))
     if len(header.chunks) != wanted or (header.count and not header.chunk_size):
-        yield broken(
-            "chunks",
-            f"{len(header.chunks):,} chunks of {header.chunk_size:,} splats; {header.count:,} splats need {wanted:,}",
-        )
+        text = f"{len(header.chunks):,} chunks of {header.chunk_size:,} splats; {header.count:,} splats need {wanted:,}"
+        yield broken("chunks", text)
     if header.max_sh > MAX_SH_DEGREE:
         yield RuleViolation("container.version", f"it has SH degree {header.max_sh}; RAD has 0 to {MAX_SH_DEGREE}")
     total = sum(entry.bytes for entry in header.chunks)
     if total != header.all_chunk_bytes:
-        text = f"allChunkBytes is {header.all_chunk_bytes:,}, but its chunks have {total:,} bytes"
-        yield broken("total", text, fatal=False)
+        yield broken("total", f"allChunkBytes is {header.all_chunk_bytes:,}, but its chunks have {total:,} bytes")
     if file_size is not None:
         yield from _places(header, file_size, files)
     if not header.padded_with_zeros:
-        yield broken("padding", "the padding of its header is not zeros", fatal=False)
+        yield broken("padding", "the padding of its header is not zeros")
     if 0 < header.chunk_size != CHUNK_NODES and header.count > min(header.chunk_size, CHUNK_NODES):
         text = f"its chunks have {header.chunk_size:,} splats; Spark streams only chunks of {CHUNK_NODES:,}"
-        yield broken("chunk-size", text, fatal=False)
-    if header.sh_code_count is not None and header.sh_code_count != expected_count(header, 0):
-        yield broken(
-            "palette",
-            f"its palette has {header.sh_code_count:,} codes, but its first chunk {expected_count(header, 0):,} splats;"
-            " Spark reads only as many codes",
-        )
+        yield broken("chunk-size", text)
+    first = expected_count(header, 0)
+    if header.sh_code_count is not None and header.sh_code_count != first:
+        text = f"its palette has {header.sh_code_count:,} codes, but its first chunk {first:,} splats"
+        yield broken("palette", f"{text}; Spark reads only as many codes")
     if header.lod_tree and header.encoding is not None and not header.encoding.lod_opacity:
-        yield broken("opacity", "it has a tree, but its splatEncoding has no lodOpacity", fatal=False)
+        yield broken("opacity", "it has a tree, but its splatEncoding has no lodOpacity")
 
 
 def _places(header: RadHeader, file_size: int, files: Mapping[str, int | str] | None) -> Iterator[RuleViolation]:
-    """Yield the violations of chunks in their files."""
     by_file: dict[str | None, list[tuple[int, RadChunkEntry]]] = defaultdict(list)
     for number, entry in enumerate(header.chunks):
         by_file[entry.filename].append((number, entry))
     for name, entries in by_file.items():
-        at, in_order = 0, True
-        size: int | str
+        at, in_order, size = 0, True, 0 if files is None or name is None else files[name]
         for number, entry in entries:
             if entry.offset < at:
                 yield broken("offsets", f"chunk {number:,} begins at {entry.offset:,}, inside the one before it")
@@ -406,11 +398,10 @@ def _places(header: RadHeader, file_size: int, files: Mapping[str, int | str] | 
                 yield broken("offsets", text, fatal=name is None)
             in_order &= entry.offset == at
             if entry.bytes % ALIGNMENT:
-                text = f"chunk {number:,} has {entry.bytes:,} bytes, which is no multiple of {ALIGNMENT}"
-                yield broken("padding", text, fatal=False)
+                yield broken("padding", f"chunk {number:,} has {entry.bytes:,} bytes, no multiple of {ALIGNMENT}")
             at = max(at, entry.offset + entry.bytes)
         if name is not None and files is not None:
-            size, code, subject = files[name], "rad.chunk-files", quoted_value(name)
+            code, subject = "rad.chunk-files", quoted_value(name)
             followed = f"the chunk in {subject}"
         elif name is None and in_order:
             size, code, subject = file_size - header.bytes, "container.cut-short", "it"
@@ -426,29 +417,24 @@ def _places(header: RadHeader, file_size: int, files: Mapping[str, int | str] | 
 
 
 def chunk_violations(header: RadHeader, number: int, chunk: RadChunkHeader, size: int) -> Iterator[RuleViolation]:
-    """Yield the broken rules of a chunk's header."""
+    """Yield the rules that the header of a chunk of `size` bytes breaks."""
     name = f"chunk {number:,}"
     base, count = number * header.chunk_size, expected_count(header, number)
     if (chunk.base, chunk.count) != (base, count):
-        yield broken(
-            "bases",
-            f"{name} is of {chunk.count:,} splats from {chunk.base:,} on; in its place are {count:,} from {base:,} on",
-        )
+        text = f"{name} is of {chunk.count:,} splats from {chunk.base:,} on"
+        yield broken("bases", f"{text}; in its place are {count:,} from {base:,} on")
     if chunk.stored_payload_bytes != size - chunk.bytes:
         text = f"{name} has {size - chunk.bytes:,} bytes after its header, which says {chunk.stored_payload_bytes:,}"
         yield broken("sizes", text)
     if chunk.payload_bytes != chunk.stored_payload_bytes:
-        text = (
-            f"payloadBytes of {name} is {chunk.payload_bytes:,}, but {chunk.stored_payload_bytes:,} before its payload"
-        )
-        yield broken("sizes", text, fatal=False)
+        text = f"payloadBytes of {name} is {chunk.payload_bytes:,}, but its header ends with"
+        yield broken("sizes", f"{text} {chunk.stored_payload_bytes:,}", fatal=False)
     if not chunk.padded_with_zeros:
-        yield broken("padding", f"the padding of the header of {name} is not zeros", fatal=False)
+        yield broken("padding", f"the padding of the header of {name} is not zeros")
     if (chunk.max_sh, chunk.lod_tree) != (header.max_sh, header.lod_tree):
-        text = f"{name} has {_kind_of(chunk)}, but the file {_kind_of(header)}"
-        yield broken("kind", text, fatal=False)
+        yield broken("kind", f"{name} has {_kind_of(chunk)}, but the file {_kind_of(header)}")
     if chunk.encoding != header.encoding:
-        yield broken("ranges", f"splatEncoding of {name} is not that of the file", fatal=False)
+        yield broken("ranges", f"splatEncoding of {name} is not that of the file")
     yield from _payload(number, chunk, size - chunk.bytes)
     yield from _names(header, number, [each.name for each in chunk.properties])
     for each in chunk.properties:
@@ -464,8 +450,7 @@ def _payload(number: int, chunk: RadChunkHeader, payload: int) -> Iterator[RuleV
     for each in chunk.properties:
         subject = f"property {quoted_value(each.name)} of chunk {number:,}"
         if each.offset != at:
-            text = f"{subject} begins at {each.offset:,}, not at {at:,}, where the one before ends"
-            yield broken("offsets", text)
+            yield broken("offsets", f"{subject} begins at {each.offset:,}, not at {at:,}, where the one before ends")
         at = each.offset + each.bytes + padding(each.bytes)
         if each.offset + each.bytes > payload:
             yield broken("sizes", f"{subject} ends at {each.offset + each.bytes:,}, of {payload:,} bytes")
@@ -496,11 +481,11 @@ def _names(header: RadHeader, number: int, names: list[str]) -> Iterator[RuleVio
         yield broken("properties", f"{where} has {', '.join(extra)}, which does not belong there", fatal=False)
     known = [name for name in names if name in BY_NAME]
     if not twice and known != [name for name in BY_NAME if name in known]:
-        yield broken("order", f"the properties of {where} are in the order {', '.join(known)}", fatal=False)
+        yield broken("order", f"the properties of {where} are in the order {', '.join(known)}")
 
 
 def _belongs(row: Row, header: RadHeader, number: int | None, *, labels: bool) -> bool:
-    """Return True if a property belongs into a chunk of this number, or into any."""
+    """Return whether a property belongs into a chunk of this number; None for any chunk."""
     if row.column in ("child_count", "child_start"):
         return header.lod_tree
     if row.codes and number:

@@ -534,7 +534,7 @@ def stored(source: OpenFile, options: WriteOptions) -> tuple[list[StoredChunk], 
         the codes, and the options, which have the file's value where they leave a choice open.
     """
     reader, chunks = RadReader.open(source.file, source.open_companion), []
-    for packed in reader.packed():
+    for packed in map(reader.packed, range(len(reader.header.chunks))):
         count, properties = packed.header.count, {each.name: each for each in packed.header.properties}
         codes = {}
         for row in PROPERTIES:
