@@ -1,4 +1,4 @@
-"""Arguments of the API, checked before they reach a loop or a kernel: errors say the value, and what to give."""
+"""Checks of arguments of public functions, before a loop or a kernel gets them: errors say the value and a remedy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..system.progress import Progress, silent
 
 
 def scene_like(value: Any) -> Scene:
-    """Return a scene, or a tree, which is validated."""
+    """Check that an argument is a scene, and validate its tree."""
     if not isinstance(value, Scene):
         raise TypeError(f"it takes a scene or a tree, not {_kind(value)}; {_SCENES}")
     value.check_tree()
@@ -29,7 +29,7 @@ def scene_like(value: Any) -> Scene:
 
 
 def camera_like(value: Any) -> Camera:
-    """Return a camera; raise an error for anything else, and for numbers that are not finite."""
+    """Check that an argument is a camera of finite numbers."""
     if not isinstance(value, Camera):
         raise TypeError(f"a camera is a Camera, not {_kind(value)}; Camera.look_at makes one, read_cameras reads paths")
     for name in ("camera_to_world", "width", "height", "focal", "principal", "time"):
@@ -40,7 +40,7 @@ def camera_like(value: Any) -> Camera:
 
 
 def path_like(cameras: CameraPath | Iterable[Camera]) -> CameraPath:
-    """Return cameras one after the other; raise a ValueError unless they are in the order of their times."""
+    """Return the camera path of an argument; raise `ValueError` unless cameras are in the order of their times."""
     if isinstance(cameras, CameraPath):
         for each in cameras.cameras:
             camera_like(each)
@@ -60,7 +60,7 @@ BudgetLike = int | float | str | np.integer[Any] | np.floating[Any]
 
 
 def budget_like(budget: BudgetLike) -> Budget:
-    """Return a budget of splats; raise an error for one that is out of range."""
+    """Return the budget of an argument; raise an error for one that is out of range."""
     if isinstance(budget, str):
         return parse_budget(budget)
     if isinstance(budget, bool) or not isinstance(budget, (int, float, np.integer, np.floating)):
@@ -74,14 +74,14 @@ def budget_like(budget: BudgetLike) -> Budget:
 
 
 def file_path(path: Path | str) -> Path:
-    """Return the path of a file that will be written; raise an `OutputError` for a folder."""
+    """Return the path of an output file; raise an `OutputError` for a folder."""
     if os.fspath(path).endswith(("/", os.sep)) or Path(path).is_dir():
         raise OutputError(f"{path} is a folder; name a file in it")
     return Path(path)
 
 
 def viewed_like(value: Any) -> None:
-    """Raise TypeError for a value that is no scene, though Python could iterate over it."""
+    """Raise `TypeError` for anything but a scene or an iterable of scenes; a text is neither."""
     if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
         raise TypeError(f"it takes scenes, trees or instances, not {_kind(value)}; {_SCENES}")
 
@@ -94,38 +94,30 @@ def _kind(value: Any) -> str:
     return repr(value) if isinstance(value, str) else f"a {type(value).__name__}" if value is not None else "None"
 
 
-#: A callback `(stage, done, total, unit)`, a class of bars that is called as `tqdm.tqdm` is, or None.
+#: A callback `(stage, done, total, unit)`, a class of progress bars such as `tqdm.tqdm`, or None.
 ProgressLike = Progress | type[Any] | None
-
-
-class _Bars:
-    """One bar for each stage, of a class that makes bars."""
-
-    def __init__(self, kind: type[Any]) -> None:
-        self._kind, self._stage = kind, ""
-        self._bar: Any = None
-
-    def __call__(self, stage: str, done: int, total: int, unit: str) -> None:
-        if self._bar is None or stage != self._stage:
-            self.close()
-            self._stage, self._bar = stage, self._kind(total=total, desc=stage, unit=f" {unit}s", leave=False)
-        self._bar.update(done - self._bar.n)
-
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
 
 
 @contextlib.contextmanager
 def progress_callback(progress: ProgressLike) -> Iterator[Progress]:
-    """Yield the callback for work inside; bars are closed at its end."""
-    if progress is None:
-        yield silent
-    elif isinstance(progress, type):
-        bars = _Bars(progress)
-        try:
-            yield bars
-        finally:
-            bars.close()
-    else:
-        yield progress
+    """Yield the callback of a `ProgressLike`: of a class of bars, one that shows a bar for each stage."""
+    if not isinstance(progress, type):
+        yield progress or silent
+        return
+    kind: type[Any] = progress
+    bars: dict[str, Any] = {}
+
+    def show(stage: str, done: int, total: int, unit: str) -> None:
+        if stage not in bars:
+            close()
+            bars[stage] = kind(total=total, desc=stage, unit=f" {unit}s", leave=False)
+        bars[stage].update(done - bars[stage].n)
+
+    def close() -> None:
+        while bars:
+            bars.popitem()[1].close()
+
+    try:
+        yield show
+    finally:
+        close()

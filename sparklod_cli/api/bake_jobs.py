@@ -1,4 +1,4 @@
-"""The jobs of `build-lod` and `simplify`: inputs become files, one after the other or on a cluster."""
+"""Work of `build-lod` and `simplify`: inputs become files, one after the other or on a cluster."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from ..system.progress import Progress, silent
 if TYPE_CHECKING:
     from ..model.instances import Instance
 
-#: Shows stages of work, by name with their relative times, as one job.
+#: Context in which stages of work, by name with their relative times, are shown as one job.
 Job = Callable[[Mapping[str, float]], contextlib.AbstractContextManager[None]]
 
 #: An input and its output.
 Pair = tuple[Source, Place]
 
-#: Result for an input; None where the output exists already.
+#: Result for an input; None if the output exists already.
 Outcome = Baked | SparklodError | None
 
 
 def merged_source(files: Sequence[Place], instances: Sequence[Instance] = ()) -> Source:
-    """Return the source that is one scene of files, or else of the files of instances, each where it stands."""
+    """Merge the files of instances, each where it stands, or else `files` where their own coordinates put them."""
     placed = tuple((each.file, each.transform) for each in instances if each.file is not None)
     return Merged(placed) if placed else Merged.of(files)
 
@@ -59,10 +59,10 @@ def bake_files(
         say: receives one-line messages for the user.
         skip: skip outputs of the same inputs and settings: "date" compares sizes and dates, "verify" contents; None
             bakes all.
-        scheduler, workers, cluster_threads: see `cluster`; one is used if one of the first two is given.
+        scheduler, workers, cluster_threads: see `cluster.cluster`, which is used if one of the first two is set.
 
     Raises:
-        SparklodError: there is no such cluster.
+        SparklodError: the cluster cannot be used.
     """
     make: Callable[..., Baked | None] = bake
     if skip is not None:

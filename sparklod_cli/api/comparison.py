@@ -1,9 +1,10 @@
-"""Comparison of cuts with full detail: its pictures, the table of their errors, and its summary by budget."""
+"""Comparison of cuts with full detail: pictures, a table of their errors, and a summary by budget."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -66,19 +67,13 @@ EMPTY = {
 
 @dataclass(frozen=True)
 class BudgetSummary:
-    """Summary of the frames of a budget.
+    """Summary of the frames of a budget: means of the `COLUMNS`, and extremes, as the names say.
 
     Attributes:
-        text: the budget, as it was given.
-        budget, share: see `COLUMNS`.
-        selected: mean.
-        psnr, psnr_min, psnr_max, psnr_black, psnr_white: dB; means but for the least and the most.
-        ssim, ssim_min: mean and least.
-        edge_psnr, edge_psnr_min: dB, mean and least of the frames that have edges; None if none has.
-        worst_tile_psnr: the least, dB.
-        worst_frame, worst_tile_x, worst_tile_y: where that is.
-        popping, popping_max: mean and most, in steps of 8 bits; None if no frame follows another.
-        popping_frame: the frame that has the most; None as well.
+        text: the budget as the user wrote it.
+        edge_psnr, edge_psnr_min: of frames that have edges; None without any.
+        worst_tile_psnr: least of all frames, dB; `worst_frame`, `worst_tile_x` and `worst_tile_y` locate the tile.
+        popping, popping_max, popping_frame: mean, greatest, and its frame; None where no frame follows another.
     """
 
     text: str
@@ -105,70 +100,65 @@ class BudgetSummary:
 
 
 def rows_by_budget(rows: Iterable[Row], budgets: int) -> list[list[Row]]:
-    """Return the rows of each of some budgets, in the order of the frames."""
+    """Divide the rows of a comparison into those of each budget, in the order of the frames."""
     every = list(rows)
     return [every[at::budgets] for at in range(budgets)]
 
 
 def summarize(rows: Iterable[Row], budgets: Sequence[str]) -> list[BudgetSummary]:
-    """Return the summary of the rows of a comparison for each budget, named as it was given."""
+    """Summarize the rows of a comparison for each budget, whose texts name the summaries."""
     return list(map(_summary, budgets, rows_by_budget(rows, len(budgets))))
 
 
-def _summary(text: str, rows: Sequence[Row]) -> BudgetSummary:
+def _summary(text: str, rows: Sequence[dict[str, Any]]) -> BudgetSummary:
     def of(name: str, which: str = "mean") -> Any:
         cells = numbers(rows, name)
         return float(f"{statistic(which, cells):.9g}") if cells else None
 
-    first = rows[0]
-    worst = min(rows, key=lambda row: numbers([row], "worst_tile_psnr")[0])
+    worst = min(rows, key=itemgetter("worst_tile_psnr"))
     popped = [row for row in rows if row["popping"] is not None]
-    most = max(popped, key=lambda row: numbers([row], "popping")[0], default=None)
-    places = {"worst_frame": "frame", "worst_tile_x": "worst_tile_x", "worst_tile_y": "worst_tile_y"}
     means = ("selected", "psnr", "psnr_black", "psnr_white", "ssim", "edge_psnr", "popping")
     return BudgetSummary(
         text=text,
-        budget=int(numbers([first], "budget")[0]),
-        share=float(numbers([first], "share")[0]),
+        budget=rows[0]["budget"],
+        share=rows[0]["share"],
         frames=len(rows),
         worst_tile_psnr=of("worst_tile_psnr", "min"),
-        popping_frame=None if most is None else int(numbers([most], "frame")[0]),
+        worst_frame=worst["frame"],
+        worst_tile_x=worst["worst_tile_x"],
+        worst_tile_y=worst["worst_tile_y"],
+        popping_frame=max(popped, key=itemgetter("popping"))["frame"] if popped else None,
         **{name: of(name) for name in means},
         **{f"{name}_min": of(name, "min") for name in ("psnr", "ssim", "edge_psnr")},
         **{f"{name}_max": of(name, "max") for name in ("psnr", "popping")},
-        **{name: int(numbers([worst], column)[0]) for name, column in places.items()},
     )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ComparisonTable(Table):
-    """The rows of a comparison: for each camera one for each budget.
-
-    Attributes:
-        budgets: as they were given.
-    """
+    """Table of a comparison: for each camera one row for each budget, whose texts are `budgets`."""
 
     budgets: Sequence[str]
 
     def summary(self) -> list[BudgetSummary]:
-        """Return means and extremes over the frames, for each budget."""
+        """Return means and extremes over the frames of each budget."""
         return summarize(self.rows, self.budgets)
 
 
-#: Threads that measure pictures; each has a few that wait, which take memory.
+#: Most threads that measure pictures, as each has a few pictures waiting in memory.
 MEASURERS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class PicturePair:
-    """A cut's picture and that of full detail, of one camera.
+    """Pictures of a cut and of full detail by one camera.
 
     Attributes:
-        row: the cells known so far.
+        row: cells that need no measurement.
         image, full: (H, W, 4) of the cut and of full detail.
         edges: (H, W) where full detail has edges.
-        before: the pictures, of the same budget, that they follow in a movement; None for the first. Those have no
-            `before`, so that no more than two frames are kept.
+        before: pictures of the previous frame at the same budget, without their own `before`, so that only two frames
+            are in memory; None where the camera does not follow another.
     """
 
     row: Row
@@ -179,13 +169,12 @@ class PicturePair:
 
 
 class Comparison:
-    """Scenes at several budgets, against full detail.
+    """Comparison of scenes at several budgets with full detail.
 
     Args:
-        scenes: trees alone, read with all columns of their splats.
-        lod: settings of the cuts but for the budget.
-        full: full detail; None for the leaves of the trees.
-
+        scenes: trees only, read with all columns of their splats.
+        lod: settings of the cuts, except the budget.
+        full: scenes that are full detail; None for the leaves of the trees.
     """
 
     def __init__(
@@ -211,9 +200,8 @@ class Comparison:
     def run(self, path: CameraPath, *, threads: int = 1, progress: Progress = silent) -> Iterator[Row]:
         """Yield rows of `COLUMNS`: for each camera one for each budget.
 
-        Cells of `popping` are empty where a camera does not follow the one before it (`CameraPath.follows`).
-
-        Pictures are drawn one after the other, each on all the threads; meanwhile others are measured.
+        Cells of `popping` are empty where a camera does not follow the one before it (`CameraPath.follows`). Pictures
+        are drawn one after the other, each on all threads, while others are measured.
         """
         total = len(path.cameras) * len(self.counts)
         for at, row in enumerate(ordered_map(measured, self._pictures(path, threads), min(threads, MEASURERS))):
@@ -245,7 +233,7 @@ class Comparison:
 
 
 def measured(pictures: PicturePair) -> Row:
-    """Return the complete row of a comparison, with the errors of the picture."""
+    """Measure the errors of a picture, and return the complete row of the comparison."""
     row, before = pictures.row, pictures.before
     tiles = []
     for name, gray in metrics.BACKGROUNDS.items():
@@ -277,19 +265,17 @@ def compare(
     threads: int | None = None,
     progress: ProgressLike = None,
 ) -> ComparisonTable:
-    """Return how far cuts of some budgets are from full detail: PSNR, SSIM and PSNR at edges, on black and on white.
+    """Compare cuts with full detail: PSNR, SSIM and PSNR at edges, on black and on white.
 
-    Cameras that follow each other, with later times, have popping as well.
+    Popping is measured as well where cameras follow each other, with later times. The table does not depend on the
+    number of threads.
 
     Args:
         viewed: a tree, a scene at several detail levels, or instances of trees or of such scenes.
-        scene: what full detail is; None for the leaves of the trees, or level 0.
-        cameras: that both are seen by.
-        budgets: of the cuts.
-        settings: of the cuts; with Spark 2's foveation and without a pixel-scale limit unless given.
-        render: how pictures are drawn; as Spark 2 does unless given.
+        scene: full detail; None for the leaves of the trees, or level 0.
+        settings: of the cuts; by default Spark 2's foveation and no pixel-scale limit.
+        render: by default as Spark 2 draws.
         precision: see `cut`.
-        threads: to work on; None for all processors. The table does not depend on it.
 
     Raises:
         FormatError: a scene to be cut has no tree.
@@ -310,7 +296,7 @@ def compare(
 
 
 def check_chart(plot: Path, *, overwrite: bool) -> None:
-    """Raise a `SparklodError` where a chart cannot be written or drawn."""
+    """Raise a `SparklodError` if a chart cannot be written or drawn."""
     from ..images.charts import load_matplotlib
 
     check_writable(plot, overwrite=overwrite)
@@ -332,26 +318,24 @@ def compare_files(
     threads: int = 1,
     progress: Progress = silent,
 ) -> tuple[int, list[BudgetSummary], list[Outcome]]:
-    """Measure how far cuts of scenes are from full detail, and write the table and the charts.
+    """Compare cuts of scenes with full detail, and write the table and the charts.
 
     Args:
-        table: where the rows go, at once when all are known.
         asserts: assertions, each with the index of its budget; None for all budgets.
-        passed: what the bytes of the table are passed through on their way to standard output.
+        passed: filter for the bytes of a table on standard output.
 
     Returns:
-        the splats of full detail, all instances together; the summary of each budget; the outcomes of `asserts`.
+        number of splats of full detail, all instances together; summary of each budget; outcomes of the assertions.
     """
+    texts = [budget.text for budget in budgets]
     with on_threads(threads):
         comparison = Comparison(scenes, lod, budgets, render)
         rows = list(comparison.run(cameras, threads=threads, progress=progress))
     table.write(rows, passed=passed)
     groups = rows_by_budget(rows, len(budgets))
     if plot is not None:
-        from ..images.charts import plot_comparison as chart
+        from ..images.charts import plot_comparison
 
-        series = list(zip((budget.text for budget in budgets), groups, strict=True))
-        write_file(plot, [chart(series, scenes.title)], overwrite=overwrite)
+        write_file(plot, [plot_comparison(list(zip(texts, groups, strict=True)), scenes.title)], overwrite=overwrite)
     outcomes = [each for at, what in asserts for each in check([what], rows if at is None else groups[at], empty=EMPTY)]
-    summary = summarize(rows, [budget.text for budget in budgets])
-    return comparison.leaves, summary, outcomes
+    return comparison.leaves, summarize(rows, texts), outcomes

@@ -1,4 +1,4 @@
-"""Reports on splat files, with findings of checks and pictures of the files."""
+"""Reports on splat files: contents, findings, and pictures."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from ..images.scene_plots import DescribedPicture
 
 
-#: Width and height of the thumbnail on a page, pixels; the splats of the cut that it shows; and the most splats of a
-#: scene without a tree that is drawn for it: more take seconds.
+#: Thumbnail of a page: width and height, pixels; budget of the cut that it shows; and the largest scene without a tree,
+#: splats, that it shows: larger ones take seconds.
 THUMBNAIL, THUMBNAIL_BUDGET, MOST_SPLATS = (512, 384), 200_000, 3_000_000
 
 
@@ -42,9 +42,9 @@ def inspect(
 
     Args:
         path: of a splat file, or of a folder that holds an unpacked SOG.
-        values: look at the numbers of the splats.
-        all_quantities: every quantity of them.
-        check: look for faults. An unreadable file is a finding, not an error.
+        values: report statistics of the splats.
+        all_quantities: report statistics of every quantity.
+        check: search for faults. An unreadable file is a finding, not an error.
     """
     wanted = ReportSettings(values=values or all_quantities, all_quantities=all_quantities, check=check)
     with progress_callback(progress) as callback, memory_errors_translated():
@@ -53,10 +53,9 @@ def inspect(
 
 
 def check_outputs(plot: Path | None, html: Path | None, *, overwrite: bool) -> None:
-    """Raise a `SparklodError` where a picture or a page cannot be written or drawn, before anything is read."""
-    for target in (plot, html):
-        if target is not None:
-            check_writable(target, overwrite=overwrite)
+    """Raise a `SparklodError` if a picture or a page cannot be written or drawn; called before inputs are read."""
+    for target in filter(None, (plot, html)):
+        check_writable(target, overwrite=overwrite)
     if plot is not None:
         from ..images.pyvista_scene import load_pyvista
 
@@ -64,7 +63,7 @@ def check_outputs(plot: Path | None, html: Path | None, *, overwrite: bool) -> N
 
 
 def read_original(path: Path, *, threads: int, progress: Progress) -> Scene:
-    """Read the scene whose splats the leaves must equal; a `FormatError` names the file."""
+    """Read the scene whose splats the leaves of a file must equal; a `FormatError` names the scene's file."""
     with naming(path, FormatError):
         return read_scene(path, threads=threads, progress=progress)
 
@@ -79,12 +78,12 @@ def inspect_file(
     threads: int,
     progress: Progress,
 ) -> tuple[Report, Scene | None]:
-    """Report on a file and check it; see `inspection.report.inspect`.
+    """Report on a file as `inspection.report.inspect` does, and check it.
 
     Args:
-        expected: assertions that must hold of the file.
-        original: the scene whose splats the leaves must equal.
-        everything: report findings of all severities; otherwise a file with expectations has errors only.
+        expected: assertions on the report.
+        original: scene whose splats the leaves must equal.
+        everything: report findings of all severities; otherwise, with expectations, only errors.
     """
     report, scene = report_on(path, settings, threads=threads, progress=progress)
     if report.format is None or not (everything or expected is not None or original is not None):
@@ -99,7 +98,7 @@ def inspect_file(
 
 
 def picture_of(scene: Scene | None, by: str, depth: int | None) -> tuple[DescribedPicture | None, str | None]:
-    """Return the picture of a scene's structure, see `scene_plots.plot`, or else the reason why it cannot be drawn."""
+    """Draw the structure of a scene, see `scene_plots.plot`; return the picture, or the reason why there is none."""
     if scene is None:
         return None, "it does not hold all of its splats, so they cannot be drawn"
     from ..images import scene_plots
@@ -111,7 +110,7 @@ def picture_of(scene: Scene | None, by: str, depth: int | None) -> tuple[Describ
 
 
 def thumbnail_of(report: Report, scene: Scene, threads: int) -> DescribedPicture | None:
-    """Return the scene as a viewer draws it; None where it is broken, or too large to be drawn at once."""
+    """Draw a scene as a viewer does; return None if it is broken or too large."""
     from ..images.scene_plots import DescribedPicture
     from .splat_files import as_tree
     from .views import cut, orbit, render, show

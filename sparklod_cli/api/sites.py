@@ -1,4 +1,4 @@
-"""The job of `sparklod view`: splat files become a site, which is served or written into a folder."""
+"""Sites of `sparklod view`: a page that shows splat files, served or written into a folder."""
 
 from __future__ import annotations
 
@@ -33,32 +33,31 @@ def prepare(
     spark_dir: Path | None = None,
     progress: Progress = silent,
 ) -> Site:
-    """Return the site of some splat files.
+    """Make the site that shows splat files, at least one.
 
     Args:
-        paths: of the files, at least one.
-        served: by a `Server`; otherwise it is written.
+        served: a `Server` will serve the site; otherwise `export` will write it.
         look_at: eye and target of the camera; None for one that sees the whole scene.
-        fov: its vertical field of view, degrees; None for 60.
-        up: direction that is up; None for what the files note, or -y.
+        fov: vertical field of view, degrees; None for 60.
+        up: None for the direction that the files note, or -y.
         budget: splats; None for Spark's default on the device.
-        camera_path: file of cameras that the page plays; None for none.
+        camera_path: file of cameras that the page plays.
         spark_dir: folder whose node_modules has Spark, PlayCanvas or CesiumJS, and three.js; None for a CDN, which has
             no CesiumJS.
 
     Raises:
-        SparklodError: a file or a library is missing or broken, the camera makes no sense, or a site that is written
-            holds a file that Spark does not read.
+        SparklodError: a file or a library is missing or broken, the camera is invalid, or Spark does not read a file of
+            a site to be written.
     """
     shown = shown_files(paths)
     for file in shown:
-        if file.note is not None and not served:  # a page that is served says so itself
+        if file.note is not None and not served:  # a served page shows the note
             raise NotSplatsError(f"{file.path.parent / file.note}")
     engine = shown[0].engine
     if budget is not None and engine == "cesium":
         raise SparklodError(f"{shown[0].path}: CesiumJS has no budget of splats; leave out --budget")
     libraries = from_cdn(engine) if spark_dir is None else from_folder(spark_dir, engine)
-    # Files are read only after the camera path, unless its cameras need their up axis.
+    # Files are read after the camera path, unless its cameras need the files' up axis.
     extents = functools.cache(lambda: [extent_of(file, threads=threads, progress=progress) for file in shown])
     cameras = Settings(up=up, up_of_scene=lambda: common_axis(extent.up for extent in extents()))
     path = None

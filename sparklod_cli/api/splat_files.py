@@ -1,4 +1,4 @@
-"""Splat files: read, write, pack for a viewer; RAD in parts."""
+"""Reads and writes splat files, the parts of RAD files, and arrays in the layouts of viewers' memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from ..codecs.formats import DEFAULT_COMPRESSION, MANIFEST, NPZ, RAW_SUFFIXES, WRITABLE, ending_of
+from ..codecs.formats import DEFAULT_COMPRESSION, ENCODINGS, MANIFEST, NPZ, RAW_SUFFIXES, WRITABLE, ending_of
 from ..codecs.options import RadOptions, SogOptions, WriteOptions
 from ..codecs.reader import check_valid
 from ..codecs.spark_codings import SplatEncoding
@@ -33,7 +33,6 @@ from ..system.errors import (
     naming,
 )
 from ..system.output import Output
-from ..system.progress import Progress
 from ..system.threads import thread_count
 from .arguments import ProgressLike, file_path, progress_callback, scene_like
 
@@ -43,13 +42,13 @@ if TYPE_CHECKING:
     from ..codecs.rad.rad_header import RadHeader
     from ..codecs.rad.rad_reader import RadChunk
 
-#: Errors of public functions that begin with the name of the file.
+#: Errors of public functions to which the name of the file is added.
 OF_FILES = (FormatError, InvalidSplatsError, TreeError)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Tree(Scene):
-    """A scene with a Level-of-Detail tree: its splats are the nodes, and `tree` says which are whose children."""
+    """A scene with a Level-of-Detail tree: its splats are the nodes, and `tree` links parents with children."""
 
     tree: LodTree = field()
 
@@ -75,52 +74,46 @@ def read(
 
     Args:
         path: of a file, or of a folder that holds an unpacked SOG or a Streamed SOG, of which level 0 is read.
-        columns: of `Splats`, where not all are needed; the others may be 0.
+        columns: of `Splats` to read; the others may be 0. None for all.
 
     Raises:
-        FormatError: it cannot be read, is of no known format, or broken.
-        TreeError: its tree is broken.
-        OutOfMemoryError: it does not fit into memory.
+        FormatError: the file cannot be read, is of no known format, or is broken.
+        TreeError: the tree is broken.
+        OutOfMemoryError: the scene does not fit into memory.
     """
     path = Path(path)
     with progress_callback(progress) as callback, memory_errors_translated(), naming(path, OF_FILES):
-        count = thread_count(threads)
-        if columns is None:
-            scene = read_scene(path, threads=count, progress=callback)
-        else:
-            unknown = sorted(set(columns) - set(COLUMNS))
-            if unknown:
-                raise ValueError(f"there is no column {', '.join(unknown)}; give some of {', '.join(COLUMNS)}")
-            scene = read_scene(path, columns=columns, threads=count, progress=callback, validate=False)
+        if unknown := sorted(set(columns or ()) - set(COLUMNS)):
+            raise ValueError(f"there is no column {', '.join(unknown)}; give some of {', '.join(COLUMNS)}")
+        every = COLUMNS if columns is None else columns
+        count, validate = thread_count(threads), columns is None
+        scene = read_scene(path, columns=every, threads=count, progress=callback, validate=validate)
         if scene.tree is not None:
             scene.tree.validate()
     return as_tree(scene)
 
 
 def as_tree(scene: Scene) -> Scene:
-    """Return a scene as a `Tree` where it has one."""
+    """Return a scene that has a tree as a `Tree`, and any other unchanged."""
     if scene.tree is None or isinstance(scene, Tree):
         return scene
     return Tree(**{each.name: getattr(scene, each.name) for each in fields(Scene)})
 
 
 def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str, NDArray[np.uint32]]:
-    """Return a scene in the layout of a viewer's memory, as `convert --layout` writes it (docs/formats/memory.md).
+    """Pack a scene into the layout of a viewer's memory, as `convert --layout` does (docs/formats/memory.md).
 
     Args:
-        scene: a scene or a tree.
         encoding: "packed", "ext", "lodtree" (of a tree) or "texture".
 
     Returns:
-        arrays of uint32 words by their names, N rows each but for a texture.
+        arrays of uint32 words by name, with N rows each, except a texture.
 
     Raises:
         InvalidSplatsError, TreeError: a splat is invalid, or the tree is broken.
-        ValueError: there is no such encoding, or no tree for it.
+        ValueError: there is no such encoding, or the scene has no tree for it.
     """
     from ..codecs import array_files
-    from ..codecs.formats import ENCODINGS
-    from ..codecs.reader import check_valid
 
     if encoding not in ENCODINGS:
         raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")
@@ -130,17 +123,16 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
 
 
 def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = None) -> Scene:
-    """Return the scene in arrays of `pack`, or of a viewer; a `Tree` where the words of a LodTree are among them.
+    """Unpack the scene in arrays of `pack` or of a viewer; it is a `Tree` if they have the words of a LodTree.
 
     Args:
-        arrays: those of "packed" or of "ext", and of "lodtree" where there is a tree.
+        arrays: of the encodings "packed" or "ext", and "lodtree" for a tree.
 
     Raises:
         FormatError: an array is missing, or has another shape or type.
         TreeError: the tree is broken.
     """
     from ..codecs import ext_splats, packed_splats, spark_nodes
-    from ..codecs.spark_codings import SplatEncoding
 
     count = thread_count(threads)
     tree = spark_nodes.unpack(arrays).tree if "lod_tree" in arrays else None
@@ -158,31 +150,31 @@ def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = No
 
 
 def read_rad_header(path: Path | str) -> RadHeader:
-    """Read the header of a RAD file alone; its chunks may be missing.
+    """Read only the header of a RAD file, whose chunks may be missing.
 
     Args:
         path: of a .rad file, whole or with chunks in files of their own.
 
     Raises:
-        FormatError: it cannot be read, is not a RAD header, or contradicts itself.
+        FormatError: the file cannot be read, or its header is no RAD header or contradicts itself.
     """
     with _opened_rad(Path(path)) as (_, header):
         return header
 
 
 def read_rad_chunk(path: Path | str, number: int, *, palette: FloatArray | None = None) -> RadChunk:
-    """Read the header of a RAD file and the bytes of one chunk, as a viewer does that streams it.
+    """Read the header of a RAD file and one chunk, as a viewer that streams the file does.
 
     Args:
         path: of a .rad file, whole or with chunks in files of their own.
-        number: of the chunk, from 0; `read_rad_header(path).chunks` has them all.
-        palette: (codes, K, 3) SH coefficients, the `palette` of chunk 0, where the file has one. Without it, the other
+        number: of the chunk, from 0; `read_rad_header(path).chunks` lists all.
+        palette: (codes, K, 3) SH coefficients, the `palette` of chunk 0, if the file has one. Without it, the other
             chunks of such a file have `labels` and no SH.
 
     Raises:
         FormatError: the header or the chunk cannot be read, or is broken.
-        TypeError: the number is not a whole one.
-        ValueError: there is no such chunk, or the palette is of another SH degree than the file.
+        TypeError: the number is not an integer.
+        ValueError: there is no such chunk, or the palette and the file have different SH degrees.
     """
     from ..codecs.rad.rad_reader import RadReader
 
@@ -212,12 +204,11 @@ def _opened_rad(path: Path) -> Iterator[tuple[BinaryIO, RadHeader]]:
 
 @dataclass(frozen=True)
 class Written:
-    """A file that was written.
+    """File that `write` wrote.
 
     Attributes:
-        path: of the file.
         format: for display ("SPZ", "PLY"), or the name of an encoding.
-        bytes: its size.
+        bytes: size of the file, or of all files.
     """
 
     path: Path
@@ -243,57 +234,51 @@ def write(
     threads: int | None = None,
     progress: ProgressLike = None,
 ) -> Written:
-    """Write a scene, or a tree, whole or not at all. Nodes keep their order, see `arrange_chunks`.
+    """Write a scene or a tree; all its files appear, or none.
+
+    Nodes keep their order, see `arrange_chunks`. The bytes do not depend on the number of threads.
 
     Args:
-        path: of the file, whose suffix chooses the format: .spz or .rad; for a scene without a tree, .ply, .sog,
-            .glb or .splat, too. Of several files, it names the first, and all appear or none: meta.json has the images
-            of an unpacked SOG beside it; for a tree, lod-meta.json has the folders of a Streamed SOG.
-        scene: what is written.
-        overwrite: replace a file that exists.
+        path: its suffix chooses the format: .spz or .rad; for a scene without a tree, also .ply, .sog, .glb or .splat.
+            The first of several files is named: meta.json, which has the images of an unpacked SOG beside it; for a
+            tree, lod-meta.json, which has the folders of a Streamed SOG beside it.
         spz_version: of SPZ, 2, 3, or for a scene without a tree 4; None for 3.
         fractional_bits: of SPZ positions, 0 to 24; None for as many as suit the scene.
         compression_level: of SPZ and RAD, 1 (fast) to 9 (small).
-        chunked: of RAD: write each chunk into a file of its own, NAME-0.radc and so on, beside the header; all files
-            appear, or none.
+        chunked: of RAD: write each chunk into a file of its own, NAME-0.radc and so on, beside the header.
         rad: further options of RAD.
         sog: options of SOG.
-        glb_profile: of GLB, "khronos" (the extension KHR_gaussian_splatting; unless given) or "cesium" (SPZ inside).
-        encoding: write the arrays of "packed", "ext", "lodtree" or "texture" as .npz instead, or as the words alone
-            where the path ends in .bin or .raw.
-        detail: of a Streamed SOG, which regions and detail levels are made of the tree.
+        glb_profile: of GLB, "khronos" (default, the extension KHR_gaussian_splatting) or "cesium" (SPZ inside).
+        encoding: write the arrays of "packed", "ext", "lodtree" or "texture" instead, as .npz, or only the words if the
+            path ends in .bin or .raw.
+        detail: of a Streamed SOG, regions and detail levels to make.
         environment: of a Streamed SOG, a scene without a tree whose splats are always drawn, such as a sky.
-        threads: to encode on; None for all processors. The bytes do not depend on it.
 
     Raises:
         FormatError: the format cannot hold the scene, or there is no such format.
-        InvalidSplatsError: the scene has no splats, or invalid ones (`Scene.from_arrays` says which these are).
+        InvalidSplatsError: the scene has no splats, or invalid ones (see `Scene.from_arrays`).
         OutputError: the file exists, or cannot be written.
         TreeError: the tree is broken.
-        TypeError: an option is of another type.
-        ValueError: an option is out of its range, or is of another format.
+        TypeError: an option has the wrong type.
+        ValueError: an option is out of its range, or belongs to another format.
     """
     path, count = file_path(path), thread_count(threads)
     form = None if encoding is not None else WRITABLE.get(ending_of(path.name))
     written = None if form is None else form.name
     streamed = encoding is None and path.name == MANIFEST
-    if (spz_version is not None or fractional_bits is not None) and written != "SPZ":
-        raise ValueError(f"{path}: spz_version and fractional_bits are of SPZ; leave them out, or write a .spz")
-    if (rad is not None or chunked) and written != "RAD":
-        raise ValueError(f"{path}: chunked and rad are of RAD; leave them out, or write a .rad")
-    if sog is not None and written != "SOG" and not streamed:
-        raise ValueError(f"{path}: sog is of SOG; leave it out, or write a .sog")
-    if glb_profile is not None and written != "GLB":
-        raise ValueError(f"{path}: glb_profile is of GLB; leave it out, or write a .glb")
-    if (detail is not None or environment is not None) and not streamed:
-        raise ValueError(f"{path}: detail and environment are of Streamed SOG; leave them out, or write a {MANIFEST}")
-    ranges = rad.ranges if isinstance(rad, RadOptions) else None
-    for name, value, kind in (
-        ("detail", detail, DetailSettings),
-        ("rad", rad, RadOptions),
-        ("sog", sog, SogOptions),
-        ("ranges", ranges, SplatEncoding),
+    spz, parts = (spz_version, fractional_bits), (detail, environment)
+    for text, applies, *values in (
+        ("spz_version and fractional_bits are of SPZ; leave them out, or write a .spz", written == "SPZ", *spz),
+        ("chunked and rad are of RAD; leave them out, or write a .rad", written == "RAD", rad, chunked or None),
+        ("sog is of SOG; leave it out, or write a .sog", written == "SOG" or streamed, sog),
+        ("glb_profile is of GLB; leave it out, or write a .glb", written == "GLB", glb_profile),
+        (f"detail and environment are of Streamed SOG; leave them out, or write a {MANIFEST}", streamed, *parts),
     ):
+        if not applies and any(value is not None for value in values):
+            raise ValueError(f"{path}: {text}")
+    ranges = rad.ranges if isinstance(rad, RadOptions) else None
+    kinds = {"detail": DetailSettings, "rad": RadOptions, "sog": SogOptions, "ranges": SplatEncoding}
+    for (name, kind), value in zip(kinds.items(), (detail, rad, sog, ranges), strict=True):
         if not isinstance(value, (kind, NoneType)):
             raise TypeError(f"{name} is {value!r}; give {'a ' if name == 'ranges' else ''}{kind.__name__}")
     rad = dataclasses.replace(rad or RadOptions(), chunked=chunked or (rad is not None and rad.chunked))
@@ -303,14 +288,37 @@ def write(
         raise InvalidSplatsError(f"{path}: the scene has no splats to write")
     with progress_callback(progress) as callback, memory_errors_translated():
         if encoding is not None:
-            return _write_arrays(path, scene, encoding, overwrite=overwrite, threads=count)
+            from ..codecs import array_files
+
+            suffix = path.suffix.lower()
+            if suffix not in (NPZ, *RAW_SUFFIXES):
+                known = ", ".join((NPZ, *RAW_SUFFIXES))
+                raise FormatError(f"{path}: arrays are written as {known}, which the name does not end in")
+            out = Output(path, overwrite=overwrite)
+            with naming(path, OF_FILES):
+                arrays = pack(scene, encoding, threads=count)
+            with out:
+                size = out.write(path.name, array_files.encode_arrays(arrays, raw=suffix in RAW_SUFFIXES))
+            return Written(path, encoding, size)
         with naming(path, OF_FILES):
             check_valid(scene.splats, count)
             if environment is not None:
                 check_valid(scene_like(environment).splats, count)
         if streamed:
+            from ..bake.parts_output import write_levels
+
             out = parts_output(path, overwrite=overwrite)
-            return _write_levels(out, scene, environment, detail or DetailSettings(), options, count, callback)
+            if scene.tree is None:
+                raise FormatError(
+                    f"{path}: detail levels are cuts of a tree; build_lod makes one, best by method='quality'"
+                )
+            if environment is not None and environment.tree is not None:
+                raise FormatError(f"{path}: the environment has a tree; extract_leaves gives its splats")
+            if environment is not None and not len(environment.splats):
+                raise InvalidSplatsError(f"{path}: the environment has no splats to write")
+            always, detail = None if environment is None else environment.splats, detail or DetailSettings()
+            size, _ = write_levels(scene, always, out, detail, options, lambda stage: None, count, callback)
+            return Written(path, "Streamed SOG", size)
         if form is None or (scene.tree is not None and not form.trees):
             known = ", ".join(ending for ending, each in WRITABLE.items() if each.trees or scene.tree is None)
             what = "a tree" if scene.tree is not None else "a scene"
@@ -318,41 +326,3 @@ def write(
         out = scene_output(path, form, chunked=rad.chunked, overwrite=overwrite)
         size = write_scene(out, form, scene, options, threads=count, progress=callback)
         return Written(path, form.name, size)
-
-
-def _write_levels(
-    out: Output,
-    scene: Scene,
-    environment: Scene | None,
-    settings: DetailSettings,
-    options: WriteOptions,
-    threads: int,
-    progress: Progress,
-) -> Written:
-    from ..bake.parts_output import write_levels
-
-    path = out.place
-    assert isinstance(path, Path)
-    if scene.tree is None:
-        raise FormatError(f"{path}: detail levels are cuts of a tree; build_lod makes one, best by method='quality'")
-    if environment is not None and scene_like(environment).tree is not None:
-        raise FormatError(f"{path}: the environment has a tree; extract_leaves gives its splats")
-    if environment is not None and not len(environment.splats):
-        raise InvalidSplatsError(f"{path}: the environment has no splats to write")
-    always = None if environment is None else environment.splats
-    size, _ = write_levels(scene, always, out, settings, options, lambda stage: None, threads, progress)
-    return Written(path, "Streamed SOG", size)
-
-
-def _write_arrays(path: Path, scene: Scene, encoding: str, *, overwrite: bool, threads: int) -> Written:
-    from ..codecs import array_files
-
-    if path.suffix.lower() not in (NPZ, *RAW_SUFFIXES):
-        known = ", ".join((NPZ, *RAW_SUFFIXES))
-        raise FormatError(f"{path}: arrays are written as {known}, which the name does not end in")
-    out = Output(path, overwrite=overwrite)
-    with naming(path, OF_FILES):
-        arrays = pack(scene, encoding, threads=threads)
-    with out:
-        size = out.write(path.name, array_files.encode_arrays(arrays, raw=path.suffix.lower() in RAW_SUFFIXES))
-        return Written(path, encoding, size)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING
 
 from ..bake.in_memory import build_tree, select
 from ..bake.settings import BakeSettings
@@ -35,9 +34,6 @@ from ..system.threads import on_threads, thread_count
 from .arguments import BudgetLike, ProgressLike, budget_like, path_like, progress_callback, scene_like
 from .splat_files import Tree
 
-if TYPE_CHECKING:
-    pass
-
 
 def build_lod(
     scene: Scene,
@@ -56,16 +52,16 @@ def build_lod(
     Args:
         scene: without a tree.
         method: "quick" or "quality".
-        base: of quick, growth of the voxel grid from level to level, 1.1 to 2.0.
-        growth: of quality, the most nodes for each leaf, 1.05 to 2.0.
-        max_sh: SH degrees above this are left out.
-        selection: which splats to keep; all that can be drawn, unless given.
-        refine: fit merged splats to pictures of full detail: True, or in how many steps, or how. The function `refine`
-            does the same and reports the gain.
+        base: with quick, growth of the voxel grid from level to level, 1.1 to 2.0.
+        growth: with quality, largest number of nodes for each leaf, 1.05 to 2.0.
+        max_sh: highest SH degree to keep.
+        selection: of splats; by default all that can be drawn.
+        refine: fit merged splats to pictures of full detail: True, or a number of steps, or settings. The function
+            `refine` does the same and reports the gain.
 
     Raises:
         FormatError: the scene has a tree already.
-        InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
+        InvalidSplatsError: splats are invalid and `selection` does not drop them, or no splats are selected.
         ValueError: there is no such method, or an option is out of its range.
     """
     if scene_like(scene).tree is not None:
@@ -104,14 +100,14 @@ def simplify(
     Args:
         scene: without a tree; or a tree, which is cut as it is.
         to: a count, a share as a float, or a text such as "100k" or "10%".
-        psnr: in place of `to`: the fewest splats whose pictures have this PSNR against the scene's, in dB.
-        refine: fit the splats to pictures of the scene: True, or in how many steps, or how.
+        psnr: in place of `to`: keep as few splats as this PSNR against pictures of the scene allows, dB.
+        refine: fit the splats to pictures of the scene: True, or a number of steps, or settings.
         cameras: of these pictures; None for cameras around and inside the scene.
-        max_sh: SH degrees above this are left out.
-        selection: which splats to keep; all that can be drawn, unless given.
+        max_sh: highest SH degree to keep.
+        selection: of splats; by default all that can be drawn.
 
     Raises:
-        InvalidSplatsError: some splats are invalid and `selection` does not drop them, or none is left.
+        InvalidSplatsError: splats are invalid and `selection` does not drop them, or no splats are selected.
         SparklodError: no camera sees anything.
         TreeError: the tree is broken.
         ValueError: not exactly one of `to` and `psnr` is given, or a number is out of its range.
@@ -160,12 +156,12 @@ def refine(
 
     Args:
         tree: of any builder, or read from a file.
-        steps: pictures of cuts that are drawn and compared; None for a number that suits the size of the tree.
-        seed: of the cameras and budgets that are drawn at random.
-        cameras: those for which it is fitted; None for cameras around and inside the scene.
-        device: "cpu", "cuda" for an NVIDIA card, or "auto" for one if there is one. On a card the result is another
-            one, but the same every time.
-        say: called with a line of text after each stage.
+        steps: number of pictures of cuts to compare; None for one that suits the size of the tree.
+        seed: of random cameras and budgets.
+        cameras: for which the tree is fitted; None for cameras around and inside the scene.
+        device: "cpu", "cuda" for an NVIDIA card, or "auto" for a card if the machine has one. Results of cards differ
+            from those of the CPU, but are the same every time.
+        say: receives a line of text after each stage.
 
     Returns:
         the tree, and its gain on held-out cameras.
@@ -173,9 +169,9 @@ def refine(
     Raises:
         FormatError: the scene has no tree.
         TreeError: the tree is broken.
-        InvalidSplatsError: a node has numbers that no splat has.
+        InvalidSplatsError: a node is no valid splat.
         ValueError: a number is out of its range, there are no cameras, or no such device.
-        BackendError: there is no card that can be used.
+        BackendError: no card can be used.
         OutOfMemoryError: it does not fit into memory.
     """
     if scene_like(tree).tree is None:
@@ -187,7 +183,7 @@ def refine(
 
 
 def fit_settings_of(refine: bool | int | FitSettings) -> FitSettings | None:
-    """Return the settings for an argument `refine`; None for no fitting."""
+    """Return the settings of fitting for an argument `refine`; None for no fitting."""
     if isinstance(refine, bool):
         return FitSettings() if refine else None
     if isinstance(refine, FitSettings):
@@ -199,7 +195,7 @@ def fit_settings_of(refine: bool | int | FitSettings) -> FitSettings | None:
 def refined_tree(
     tree: Scene, settings: FitSettings, threads: int, progress: Progress, say: Callable[[str], None] | None
 ) -> tuple[Tree, Refined]:
-    """Return a tree whose merged splats are fitted, and the gain."""
+    """Fit the merged splats of a tree; return the tree, and its gain."""
     found, report = refined(tree, settings, threads=threads, progress=progress, say=say or (lambda text: None))
     assert found.tree is not None
     return Tree(found.splats, found.tree, found.antialiased, up=found.up), report
@@ -208,12 +204,9 @@ def refined_tree(
 def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: ProgressLike = None) -> Tree:
     """Return a tree with its nodes in the order for streaming; `write` keeps the order that nodes have.
 
-    A chunk of a RAD is the next 65,536 nodes, so this order decides how many chunks a viewer fetches. docs/streaming.md
-    compares it with others; `build-lod --format rad` writes trees in it.
-
-    Args:
-        tree: its nodes in any order that a tree may have: children are consecutive and after their parent.
-        threads: to work on; None for all processors. The order does not depend on it.
+    A chunk of a RAD file is the next 65,536 nodes, so this order determines how many chunks a viewer fetches.
+    docs/streaming.md compares it with others; `build-lod --format rad` writes trees in it. The order does not depend on
+    the number of threads.
 
     Raises:
         FormatError: the scene has no tree.
@@ -230,7 +223,7 @@ def arrange_chunks(tree: Scene, *, threads: int | None = None, progress: Progres
 
 
 def extract_leaves(tree: Scene) -> Scene:
-    """Return the splats that a tree was built of, in the order of its leaves.
+    """Return the splats that a tree was built from, in the order of its leaves.
 
     Raises:
         FormatError: the scene has no tree.

@@ -1,4 +1,4 @@
-"""The jobs of `render` and `traverse`: pictures and tables of scenes, written to files."""
+"""Work of `render` and `traverse`: pictures and tables of scenes, written to files."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ def draw_files(
 
     Args:
         budget: of the cuts; None draws full detail.
-        loading: how chunks get to the viewer, and the seconds since a visitor opened the page in front of each camera;
-            None where every chunk is resident.
-        reference: the scenes whose pictures are subtracted from these.
+        loading: network and cache of the viewer, and the seconds since a visitor opened the page in front of each
+            camera; None if every chunk is resident.
+        reference: returns the scenes whose pictures are subtracted from these.
     """
     from ..images.sequence import write_pictures
 
-    settings = None if budget is None else dataclasses.replace(lod, budget=scenes.splats_of(budget))
+    def settings_of(drawn: Scenes) -> LodSettings | None:
+        return None if budget is None else dataclasses.replace(lod, budget=drawn.splats_of(budget))
+
+    settings = settings_of(scenes)
     if loading is not None and settings is not None and scenes.with_cuts:
         from ..simulation.frames import Loader
 
         source: CutFinder = Loader(scenes, settings, *loading)
     else:
         source = CutFinder(scenes, settings)
-    other = None
-    if reference is not None:
-        compared = reference()
-        cuts = None if budget is None else dataclasses.replace(lod, budget=compared.splats_of(budget))
-        other = CutFinder(compared, cuts)
+    compared = None if reference is None else reference()
+    other = None if compared is None else CutFinder(compared, settings_of(compared))
     return write_pictures(
         source, cameras, output, render, written, reference=other, overwrite=overwrite, progress=progress
     )
@@ -77,26 +77,24 @@ def traverse_files(
     threads: int = 1,
     progress: Progress = silent,
 ) -> tuple[Summary, list[Outcome], float, str | None]:
-    """Simulate what a viewer draws of scenes along a path, and write tables and charts of the frames.
+    """Simulate the frames that a viewer draws along a path, and write tables and charts of them.
 
     Args:
         by_instance: make rows of single instances, too.
 
     Returns:
-        the summary of the frames, the outcomes of `asserts`, and what `simulation.frames.write_frames` returns besides.
+        summary of the frames; outcomes of `asserts`; mean share of the drawn splats in front of the camera; and why the
+        charts have no picture of the path.
     """
-    from ..simulation.frames import Simulation, write_frames
+    from ..simulation.frames import Loader, Simulation, write_frames
     from ..simulation.results import EMPTY, LOADING, summarize
 
     settings = dataclasses.replace(lod, budget=scenes.splats_of(budget))
     simulation = Simulation(scenes, settings, streaming)
     if outputs.indices is not None:
         outputs.check_frames(cameras.numbers, len(scenes.instances))
-    loading = None
-    if not streaming.network.instant:
-        from ..simulation.frames import Loader
-
-        loading = Loader(scenes, settings, streaming).load(cameras.cameras[0])
+    instant = streaming.network.instant
+    loading = None if instant else Loader(scenes, settings, streaming).load(cameras.cameras[0])
     rows, in_front, note = write_frames(
         simulation, cameras, outputs, by_instance=by_instance, threads=threads, progress=progress, passed=passed
     )

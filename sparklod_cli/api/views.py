@@ -25,11 +25,12 @@ from ..render.rasterizer import Image
 from ..render.render_settings import RenderSettings
 from ..render.renderer import Renderer
 from ..system.errors import CameraPathError, FormatError, memory_errors_translated
+from ..system.output import write_file
 from ..system.threads import on_threads, thread_count
 from ..tables.columns import Table
 from ..viewers.loaded_scene import STREAMED_SOG, TILES, UNNAMED
 from ..viewers.scenes import Cut, CutFinder, Scenes, read_scenes
-from ..viewers.viewer_settings import BLEND, PLAYCANVAS_BUDGET, LodSettings
+from ..viewers.viewer_settings import BLEND, PLAYCANVAS_BUDGET, LodSettings, StreamingSettings
 from .arguments import (
     BudgetLike,
     ProgressLike,
@@ -44,13 +45,9 @@ from .arguments import (
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..cameras.sources import CameraPath
-    from ..render.render_settings import RenderSettings
     from ..simulation.results import Summary
-    from ..viewers.scenes import Scenes
-    from ..viewers.viewer_settings import LodSettings, StreamingSettings
 
-#: A scene, a tree or a scene at several detail levels, or several of them, each with where it stands.
+#: A scene, a tree or a scene at several detail levels, or instances of such scenes.
 Viewed = Scene | DetailScene | Instance | Iterable["Scene | DetailScene | Instance"]
 
 #: Attribute in which a scene caches its prepared form.
@@ -67,18 +64,17 @@ def cut(
     precision: str = PRECISIONS[0],
     threads: int | None = None,
 ) -> Cut:
-    """Return the nodes that a viewer draws for a camera, or the splats of the detail levels that it chooses.
+    """Find the nodes that a viewer draws for a camera, or the splats of the detail levels that it chooses.
 
     Args:
-        viewed: a tree, a scene at several detail levels, or instances. Of other scenes all splats are drawn.
-        camera: that sees them.
-        budget: the most splats that are drawn; that of `settings` unless given.
-        settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given, and for detail levels
-            those of PlayCanvas.
-        continuous: a cut that fades nodes into their children; the width of that, or True for 1.25.
-        precision: of the centres and sizes of a tree: "float32", or their half floats, "float16"; or what Spark has of
-            it, for the same cut to the last node: "ext" with `extSplats`, else "packed", or "packed-pages" where Spark
-            streams a RAD file. Of a tree that was not read from a file, Spark's are taken to be its own numbers.
+        viewed: a tree, a scene at several detail levels, or instances. Other scenes are drawn with all splats.
+        budget: largest number of splats; None for that of `settings`.
+        settings: foveation, pixel-scale limit and so on; by default those of Spark 2 on a desktop, or of PlayCanvas for
+            detail levels.
+        continuous: find a cut that fades nodes into their children: the width of the transition, or True for 1.25.
+        precision: of centres and sizes of nodes: "float32", or "float16" for half floats; or as they are in Spark, for
+            exactly its cut: "ext" with `extSplats`, else "packed", or "packed-pages" if Spark streams a RAD file. A
+            tree that was not read from a file has no such rounding.
 
     Raises:
         ValueError: the budget is out of its range, or less than one splat for each instance; `continuous` is not
@@ -98,16 +94,13 @@ def render(
     backend: str | None = None,
     threads: int | None = None,
 ) -> Image:
-    """Return the picture of a camera: of a cut, or of scenes and trees in full detail.
+    """Draw a cut, or scenes and trees in full detail.
 
-    Splats of scenes without trees that cannot be drawn are left out.
+    Invalid splats of scenes without trees are left out. The picture does not depend on the number of threads.
 
     Args:
-        viewed: a cut, or scenes and trees.
-        camera: that sees it.
-        settings: how it is drawn; as Spark 2 does unless given.
-        backend: "numba" (the reference), "osmesa" or "open3d"; that of `settings` unless given.
-        threads: to draw on; None for all processors. The picture does not depend on it.
+        settings: by default as Spark 2 draws.
+        backend: "numba" (the reference), "osmesa" or "open3d"; None for that of `settings`.
 
     Returns:
         (H, W, 4) float32: red, green and blue, multiplied by alpha, and alpha.
@@ -115,7 +108,7 @@ def render(
     Raises:
         BackendError: the backend cannot draw here.
         InvalidSplatsError: a scene has nothing to draw.
-        ValueError: there is no such backend, or it does not draw on the device.
+        ValueError: there is no such backend, or it does not support the device.
     """
     camera_like(camera)
     settings = settings or RenderSettings()
@@ -138,17 +131,17 @@ def traverse(
     threads: int | None = None,
     progress: ProgressLike = None,
 ) -> Frames:
-    """Return what a viewer draws and fetches along a camera path: a row for each frame.
+    """Simulate the drawing and fetching of a viewer along a camera path: a row for each frame.
+
+    Only the column `traverse_ms` depends on the number of threads.
 
     Args:
         viewed: a tree, a scene at several detail levels, or instances of trees or of such scenes.
-        cameras: the path.
-        budget: the most splats that are drawn; that of `settings` unless given.
-        settings: foveation, pixel-scale limit and so on; Spark 2's on a desktop unless given.
-        streaming: network and chunk cache; everything is there unless given.
-        by_instance: rows of single instances, too.
+        budget: largest number of splats; None for that of `settings`.
+        settings: foveation, pixel-scale limit and so on; by default those of Spark 2 on a desktop.
+        streaming: network and chunk cache; None if every chunk is resident.
+        by_instance: make rows of single instances, too.
         precision: see `cut`.
-        threads: to find cuts on; None for all processors. Only `traverse_ms` depends on it.
 
     Raises:
         FormatError: a scene has no tree.
@@ -165,24 +158,20 @@ def traverse(
 
 
 def psnr(a: Image, b: Image, *, background: float = 0.0) -> float:
-    """Return peak signal-to-noise ratio of two pictures, in dB; 100 where they are the same.
+    """Return the peak signal-to-noise ratio of two pictures, dB; 100 for equal pictures.
 
     Args:
-        a, b: floats: (H, W, 3) 0..1, or (H, W, 4) with alpha multiplied in, as `render` draws them.
+        a, b: floats: (H, W, 3) 0..1, or (H, W, 4) premultiplied by alpha, as `render` draws them.
         background: gray, 0..1, behind pictures with alpha.
 
     Raises:
-        ValueError: they have different shapes, or are no pictures: whole numbers, NaN, or no pixels.
+        ValueError: the shapes differ, or an array is no picture: it has integers, NaN, or no pixels.
     """
     return metrics.psnr(*_opaque(a, b, background))
 
 
 def ssim(a: Image, b: Image, *, background: float = 0.0) -> float:
-    """Return structural similarity of two pictures (Wang et al. 2004), 1 where they are the same; see `psnr`.
-
-    Raises:
-        ValueError: they have different shapes, or are no pictures.
-    """
+    """Return the structural similarity of two pictures (Wang et al. 2004), 1 for equal ones; arguments as of `psnr`."""
     return metrics.ssim(*_opaque(a, b, background))
 
 
@@ -199,7 +188,7 @@ def _opaque(a: Image, b: Image, background: float) -> list[Image]:
 
 
 class FixedCut(CutFinder):
-    """One cut for all cameras."""
+    """Finder that returns one cut for all cameras."""
 
     def __init__(self, whole: Cut) -> None:
         self.whole = whole
@@ -212,7 +201,7 @@ class FixedCut(CutFinder):
 
 
 def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0]) -> Scenes:
-    """Return the scenes, prepared for views; a single scene keeps them for the next call."""
+    """Prepare scenes for drawing; a single scene caches the result for the next call."""
     if precision not in PRECISIONS:
         raise ValueError(f"there is no precision {precision!r}; give one of {', '.join(PRECISIONS)}")
     count = thread_count(threads)
@@ -234,7 +223,7 @@ def scenes_of(viewed: Viewed, threads: int | None, precision: str = PRECISIONS[0
 
 
 def trees_of(viewed: Viewed, threads: int, precision: str) -> Scenes:
-    """Return scenes as `scenes_of`; raise a `FormatError` where one has neither a tree nor detail levels."""
+    """Prepare scenes as `scenes_of`; raise `FormatError` if one has neither a tree nor detail levels."""
     scenes = scenes_of(viewed, threads, precision)
     plain = next((loaded.name for loaded in scenes.loaded if loaded.kind is None), None)
     if plain is not None:
@@ -261,7 +250,7 @@ def _lod(
 
 
 class Frames(Table):
-    """The rows of a traversal: one for each frame and, if requested, one for each of its instances."""
+    """Table of a traversal: a row for each frame and, if requested, one for each of its instances."""
 
     def summary(self) -> Summary:
         """Return statistics of the frames, totals, and notable frames."""
@@ -271,11 +260,7 @@ class Frames(Table):
 
 
 class Picture:
-    """A picture that Jupyter shows.
-
-    Attributes:
-        png: the bytes of the file.
-    """
+    """Picture that Jupyter shows; `png` is the bytes of the file."""
 
     def __init__(self, png: bytes) -> None:
         self.png = png
@@ -293,21 +278,18 @@ class Picture:
             OutputError: the file exists, or cannot be written.
             ValueError: its name does not end in .png.
         """
-        from ..system.output import write_file
-
         path = file_path(path)
         if path.suffix.lower() != ".png":
             raise ValueError(f"{path}: a picture is saved as .png, which the name does not end in")
-
         write_file(path, [self.png], overwrite=overwrite)
 
 
 def show(image: NDArray[np.float32], *, background: tuple[float, float, float] | None = (0.0, 0.0, 0.0)) -> Picture:
-    """Return a picture of floats as one that Jupyter shows.
+    """Return a picture for Jupyter.
 
     Args:
-        image: (H, W, 4) float32 with alpha multiplied in, as `render` draws it.
-        background: red, green and blue, 0..1, behind it; None keeps alpha.
+        image: (H, W, 4) float32 premultiplied by alpha, as `render` draws it.
+        background: red, green and blue, 0..1; None keeps alpha.
 
     Raises:
         ValueError: the image has another shape.
@@ -316,7 +298,6 @@ def show(image: NDArray[np.float32], *, background: tuple[float, float, float] |
 
     if getattr(image, "ndim", 0) != 3 or image.shape[2] != 4:
         raise ValueError(f"the image has the shape {getattr(image, 'shape', ())}; give (H, W, 4), as render draws it")
-
     return Picture(pixels.encode(pixels.eight_bits(pixels.over(image, background)), "png"))
 
 
@@ -335,22 +316,21 @@ def read_cameras(
     every: int = 1,
     up: Point | None = None,
 ) -> CameraPath:
-    """Return the cameras of a file, or of a folder that COLMAP wrote; docs/cameras.md has the formats.
+    """Read the cameras of a file, or of a folder that COLMAP wrote; docs/cameras.md lists the formats.
 
     Args:
-        path: of the file or folder.
-        format: its name, as `--camera-format` has it; "auto" recognises it by the content.
-        axes: of its matrices, as `--camera-axes` has them, where the format does not say.
+        format: as `--camera-format`; "auto" recognises it by the content.
+        axes: of the matrices, as `--camera-axes`, if the format does not specify them.
         world_transform: (4, 4) or 16 numbers row by row, from the file's world to that of the splats: a rotation, a
             uniform scale and a translation.
-        size: width and height of the images, pixels; those of the file unless given.
-        fov_y: vertical field of view, degrees; that of the file unless given.
-        fps: frames a second; times are then counted anew.
+        size: width and height of the images, pixels; None for those of the file.
+        fov_y: vertical field of view, degrees; None for that of the file.
+        fps: frames a second, which replace the times of the file.
         every: n, to keep every n-th frame.
         up: x, y, z that points up, for cameras of which the file has only eye and target.
 
     Raises:
-        CameraPathError: it cannot be read, is of no known format, or has a camera that makes no sense.
+        CameraPathError: the file cannot be read, is of no known format, or has an invalid camera.
     """
     try:
         chosen = None if axes is None else Axes(axes)
@@ -367,15 +347,8 @@ def read_cameras(
     if world_transform is not None:
         numbers = np.asarray(world_transform, np.float64).ravel().tolist()
         world = similarity(",".join(map(repr, numbers)))
-    settings = Settings(
-        axes=chosen,
-        world=world,
-        size=size,
-        fov_y=None if fov_y is None else math.radians(fov_y),
-        fps=fps,
-        every=every,
-        up=up,
-    )
+    angle = None if fov_y is None else math.radians(fov_y)
+    settings = Settings(axes=chosen, world=world, size=size, fov_y=angle, fps=fps, every=every, up=up)
     return read_path(Path(path), None if format == "auto" else format, settings)
 
 
@@ -390,15 +363,14 @@ def orbit(
     fov_y: float = 60.0,
     size: tuple[int, int] = DEFAULT_SIZE,
 ) -> CameraPath:
-    """Return cameras once around scenes, as `--orbit` makes them.
+    """Return cameras once around scenes, as `--orbit` does.
 
     Args:
-        viewed: a scene or tree, or instances.
-        count: of cameras.
-        center: x, y, z that they look at; the middle of the scenes unless given.
-        distance: from there, world units; as near as all scenes are in every picture unless given.
+        count: number of cameras.
+        center: x, y, z that all cameras look at; None for the middle of the scenes.
+        distance: from the center, world units; None for the least at which every picture has all scenes.
         elevation: above the center, degrees.
-        up: x, y, z that points up; noted in the scenes unless given, or -y, as training leaves scenes.
+        up: x, y, z that points up; None for the direction that the scenes note, or -y, as after training.
         fov_y: vertical field of view, degrees.
         size: width and height of the images, pixels.
 

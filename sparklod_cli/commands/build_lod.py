@@ -67,7 +67,7 @@ from .rules import check, is_set
 
 if TYPE_CHECKING:
     from ..api.bake_jobs import Outcome, Pair
-    from ..bake.converting import Converted
+    from ..api.converting import Converted
     from ..bake.settings import Baked, BakeSettings, Source
     from ..codecs.losses import Clamp, Losses
     from ..fitting.fit_settings import Refined

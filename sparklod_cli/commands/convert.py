@@ -107,8 +107,7 @@ def convert(ctx: click.Context, /, **_: Any) -> None:
     general, source, output, target = options.general, options.source, options.output, Target.of(options.output, form)
     _check(ctx, options, target)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..bake.converting import Converted
-        from ..bake.converting import convert as convert_file
+        from ..api.converting import Converted, convert_file
 
         console.announce_compiling()
         with naming(name_of(source), (FormatError, InvalidSplatsError, OutOfMemoryError)):

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 import sparklod_cli as sparklod
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
-from sparklod_cli.bake.converting import convert
+from sparklod_cli.api.converting import convert_file
 from sparklod_cli.bake.flow import bake, stage_shares
 from sparklod_cli.bake.in_memory import select
 from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
@@ -257,7 +257,7 @@ def test_any_numbers_are_baked_refused_and_reported_without_a_warning(
                 bake(source, output, how)
                 assert no_errors(findings_in(output, source))
             else:
-                convert(source, Path(folder, f"out{ending}"), how, layout="ext" if ending == ".npz" else None)
+                convert_file(source, Path(folder, f"out{ending}"), how, layout="ext" if ending == ".npz" else None)
         report_all(source)
 
 

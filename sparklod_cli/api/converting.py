@@ -1,12 +1,16 @@
-"""Conversion of a file: its tree into another container, its splats or leaves into a plain format, or arrays."""
+"""Work of `convert`: a file in another format, which keeps its tree, holds its leaves or its splats, or arrays."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from ..bake.flow import bake
+from ..bake.in_memory import select, transformed
+from ..bake.settings import Baked, BakeSettings
+from ..bake.simplifying import leaves_of
 from ..codecs.formats import NPZ, WRITABLE
 from ..codecs.losses import Losses, settled_with_losses
 from ..codecs.reader import check_valid
@@ -18,13 +22,6 @@ from ..system.addresses import Place
 from ..system.errors import FormatError, memory_errors_translated
 from ..system.output import Output
 from ..system.progress import Progress, silent
-from .flow import bake
-from .in_memory import select, transformed
-from .settings import Baked, BakeSettings
-from .simplifying import leaves_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,9 +30,9 @@ class Converted(Losses):
 
     Attributes:
         format: of the input, for display.
-        nodes: of the input's tree; None without one.
-        splats: written.
-        dropped: splats left out, by reason.
+        nodes: number of nodes of the input's tree; None without one.
+        splats: number of written splats.
+        dropped: number of splats left out, by reason.
         seconds: by stage (read, write).
         output_format: for display, or the name of a layout.
         arrays: shape of each array, by name; empty for other outputs.
@@ -52,7 +49,7 @@ class Converted(Losses):
     arrays: dict[str, tuple[int, ...]]
 
 
-def convert(
+def convert_file(
     source: Place,
     target: Place,
     settings: BakeSettings,
@@ -66,21 +63,21 @@ def convert(
 ) -> Baked | Converted:
     """Write a splat file in another format.
 
-    A tree stays as it is where the format holds trees; otherwise its leaves are written.
+    A tree is kept if the format holds trees; otherwise its leaves are written.
 
     Args:
-        settings: format, selection and position; the rest applies to no conversion.
+        settings: of format, selection and position; others have no effect.
         layout: one of `formats.ENCODINGS`, to write arrays; None for splats.
-        leaves: write the leaves of the tree, even where the format holds trees.
+        leaves: write the leaves of the tree even if the format holds trees.
         say: receives one-line messages for the user.
 
     Raises:
         FormatError, InvalidSplatsError, OutputError: see `io.open_reader`, `Selection.check` and
-            `system.output.Output`; or the settings do not apply to a tree, or need one.
+            `system.output.Output`; or the settings have no effect on a tree, or need one.
         OutOfMemoryError: the scene does not fit into memory.
     """
     with memory_errors_translated():
-        form = None if layout is not None else WRITABLE[settings.suffix]
+        form = WRITABLE[settings.suffix] if layout is None else None
         if form is None:
             out = Output(target, overwrite=overwrite)
         else:
@@ -97,13 +94,24 @@ def convert(
         scene, dropped = _placed(scene, settings, threads)
         begun, losses = time.perf_counter(), Losses({}, drops_sh=False, up_lost=None)
         shapes: dict[str, tuple[int, ...]] = {}
-        if layout is not None:
-            size, shapes = _write_arrays(scene, layout, out, raw=settings.suffix != NPZ, threads=threads)
-        elif form is not None:
-            # Opacities of leaves make up for the rounding of their scales already.
+        if form is not None:
+            # Opacities of leaves already compensate for the rounding of their scales.
             options = dataclasses.replace(like(scene.header, settings.options), covering=nodes is None)
             options, losses = settled_with_losses(scene, form, options, threads)
             size = write_scene(out, form, scene, options, threads=threads, progress=progress)
+        else:
+            assert layout is not None
+            from ..codecs import array_files
+
+            try:
+                arrays = array_files.pack_layout(scene, layout, threads)
+            except ValueError:
+                raise FormatError(
+                    f"it has no tree, which the layout {layout} consists of; build-lod makes one"
+                ) from None
+            with out:
+                size = out.write(out.target.name, array_files.encode_arrays(arrays, raw=settings.suffix != NPZ))
+            shapes = {name: words.shape for name, words in arrays.items()}
         ended = time.perf_counter()
     return Converted(
         format=scene.format,
@@ -120,7 +128,7 @@ def convert(
 
 
 def _placed(scene: Scene, settings: BakeSettings, threads: int) -> tuple[Scene, dict[str, int]]:
-    """Return a scene with its selected splats, turned and moved, and the number of those left out, by reason."""
+    """Select and transform the splats of a scene, but no tree; also return the number of dropped splats, by reason."""
     if scene.tree is not None:
         if settings.unused:
             raise FormatError(
@@ -136,17 +144,3 @@ def _placed(scene: Scene, settings: BakeSettings, threads: int) -> tuple[Scene, 
         splats = transformed(splats, settings.transform, threads)
         up = up and rotated_axis(up, settings.transform.rotation)
     return dataclasses.replace(scene, splats=splats, up=up), dict(tally.dropped)
-
-
-def _write_arrays(
-    scene: Scene, layout: str, out: Output, *, raw: bool, threads: int
-) -> tuple[int, dict[str, tuple[int, ...]]]:
-    from ..codecs import array_files
-
-    try:
-        arrays = array_files.pack_layout(scene, layout, threads)
-    except ValueError:
-        raise FormatError(f"it has no tree, which the layout {layout} consists of; build-lod makes one") from None
-    with out:
-        size = out.write(out.target.name, array_files.encode_arrays(arrays, raw=raw))
-    return size, {name: words.shape for name, words in arrays.items()}
