@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from ..codecs.reader import Reader
 from ..codecs.statistics import Statistics
-from ..lod.stages import INVISIBLE, NO_FAMILY, Bounds, Pending
+from ..lod.bounds import INVISIBLE, Bounds
+from ..lod.stages import NO_FAMILY, drawn_splats, joined
 from ..lod.tree_settings import BUILDERS
 from ..model.selection import REASONS, SelectionTally
 from ..model.sh import width_of
@@ -298,7 +299,7 @@ def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> N
     stage, builder = job.blocks.stages[number], job.builder()
     with on_threads(threads):
         if stage.block is None:
-            pending = Pending.concat([Pending(job.store.get(pending_of(child))) for child in stage.children])
+            pending = joined([job.store.get(pending_of(child)) for child in stage.children])
         else:
             pending = builder.leaves(*_read_block(job, stage.block, threads), job.plan)
         families, left = builder.advance(pending, stage.region, number, job.plan, progress=progress)
@@ -307,11 +308,11 @@ def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> N
         job.store.put(families_of(number), {"rows": rows_of(columns.pop("nodes"), threads), **columns})
         statistics = [Statistics.of(families.nodes, families.family == NO_FAMILY, job.needed)]
         if stage.region is None:
-            root, family = left.splats, int(left.columns["family"][0])
+            root, family = drawn_splats(left), int(left["family"][0])
             job.store.put(ROOT, {"rows": rows_of(root), "family": np.array([family], np.int64)})
             statistics.append(Statistics.of(root, np.array([family == NO_FAMILY]), job.needed))
         else:
-            job.store.put(pending_of(number), left.columns)
+            job.store.put(pending_of(number), left)
     counts = np.array([len(families), len(families.family)], np.int64)
     job.store.put(stage_of(number), {"counts": counts, "statistics": Statistics.merged(statistics).array()})
 

@@ -215,8 +215,8 @@ class Job:
         return min(self.stream.sh_degree, self.settings.max_sh)
 
     def builder(self) -> StagedBuilder:
-        """Return the builder of the tree."""
-        builder: StagedBuilder = import_module(f"..lod.{self.settings.method}", __package__)
+        """Return the builder of the tree in stages."""
+        builder: StagedBuilder = import_module(f"..lod.{self.settings.method}_stages", __package__)
         return builder
 
     def part(self, number: int) -> str:

@@ -1,38 +1,33 @@
 """Quick-LoD: a tree of merged splats from voxel grids that grow by a constant factor.
 
 The levels are those of Spark's method ("Quick LoD algorithm"): a splat of size s = 2 * max(scale) belongs to level
-ceil(log_base(s)), and from the finest level up, the splats of a level join the survivors of the level below. There, all
-nodes that share a cell become one. Here, cells are wider, and in each the cheapest pairs of neighbours merge for a few
+ceil(log_base(s)), and from the finest level up, the splats of a level join the survivors of the level below. Spark
+merges all nodes of a cell into one. Here, cells are wider, and in each the cheapest pairs of neighbours merge for a few
 rounds, up to a size that grows with the level; the nodes merged into one are a family (`kernels/cell_pairs.py`).
 benchmarks/notes/quick-builder.md has the reasons, and the alternatives that were tried.
 
 For speed, leaves are sorted once, by level and Morton code, into rows with all data that a merge reads, so that each
-level reads neighbouring memory. A level is a radix sort of its cells and one parallel merge. As the nodes of a level
-are made in Morton order, writing the levels out backwards gives the final order, coarse before fine.
+level reads neighbouring memory. A level is a radix sort of its cells and one parallel merge. The nodes of a level are
+made in Morton order; levels written in reverse give the final order, coarse before fine.
 
-The same tree can be built in stages, node for node and bit for bit. In a region, only those cells are merged that no
-node from outside can be in; the nodes of the other cells are handed on. Nodes from outside merge into a node within the
-cells of its members: a mean lies between its terms, and float32 rounds it no further. So the margin of possible nodes
-from outside grows by whole cells, level by level.
+`quick_stages` builds the same tree in stages, bit for bit.
 """
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.gaussian import spark_size
 from ..model.lod_tree import LodTree
 from ..model.splats import COLUMNS, FloatArray, Splats
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, threads_for
+from .bounds import Bounds, check
 from .kernels.cell_pairs import SPAN, merge_in_cells, split_families
 from .kernels.geometry import SplatColumns
 from .kernels.node_rows import Space, fill_leaf_rows, fill_leaves, fill_merged_splats, merge_colors
@@ -48,17 +43,13 @@ from .kernels.sort import (
     sort_by_cell,
     sort_by_key,
 )
-from .stages import NO_FAMILY, STAGE_BITS, Bounds, Margins, Pending, Region, StageFamilies, check
 from .tree_settings import DEFAULT_BASE, MAX_BASE, MIN_BASE
 
-#: Level of splats that have not joined the tree: they join at the level of their size.
-NEW = -1
+if TYPE_CHECKING:
+    from .quick_stages import Margins
 
-#: Upper bound of the levels of a scene: sizes and distances of float32 span 2 ** 278, and the base is at least 1.1.
-LEVELS = 4096
-
-#: Largest coordinate in steps of a level: parts are half a step wide, their coordinates int64, and so must be their
-#: differences. No level is finer than this allows.
+#: Largest coordinate in steps of a level, which bounds the finest level: parts are half a step wide, and their
+#: coordinates and the differences of these are int64.
 MAX_STEPS = 2.0**59
 
 #: Edge of a cell in steps of its level. Chosen; 8 is no better (benchmarks/notes/quick-builder.md).
@@ -71,8 +62,8 @@ PARTS = 1 << PART_BITS
 #: so that seams hardly ever recur.
 SHIFT = (0.38196601, 0.76393202, 0.14589803)
 
-#: The largest size of a merged node, in steps of its level; a node's size is about 2 * sqrt(trace of its covariance /
-#: 3). Chosen; what matters is the number of rounds (`kernels/cell_pairs.py`).
+#: Largest size of a merged node, in steps of its level; a node's size is about 2 * sqrt(trace of its covariance / 3).
+#: Chosen; the number of rounds matters more (`kernels/cell_pairs.py`).
 LIMIT = 0.7
 
 #: Largest coordinate and size, units: float32 holds its square. Chosen.
@@ -82,7 +73,7 @@ FARTHEST = 1e15
 #: float32, the base is at least 1.1), fit a uint64.
 CURVE_BITS = 17
 
-#: Number of merged nodes, which are not numbered as given nodes are.
+#: Number of the nodes merged here; only given nodes have numbers of their own.
 MERGED = np.uint32(0xFFFFFFFF)
 
 #: Rows moved at a time: their copies stay in a processor's cache.
@@ -121,11 +112,10 @@ def build(splats: Splats, base: float = DEFAULT_BASE, *, progress: Progress = si
 
 @dataclass(frozen=True, eq=False)
 class VoxelGrid:
-    """The cells of all levels, the finest of which is level 0: the same whatever part of the scene is built.
+    """The cells of all levels, level 0 the finest; the same grid for each region of a scene.
 
-    Nodes of a level are about base ** level large. A cell is wider, so that it holds several of them to choose from,
-    and is divided into parts, along which its nodes are sorted. From level to level the grid is shifted, and its seams
-    with it.
+    Nodes of a level are about base ** level large. A cell is wider, so that it has several nodes to choose pairs from,
+    and is divided into parts, along which its nodes are sorted. Each level shifts the grid, and with it the seams.
 
     Attributes:
         base: growth of the cells from level to level.
@@ -147,9 +137,9 @@ class VoxelGrid:
     space: Space
 
     def parts(self, level: int) -> Parts:
-        """Return the parts of the cells of any level; the scene's box bounds all, as a mean is in the box of its terms.
+        """Return the parts of the cells of any level; their `low` is that of a cell.
 
-        `low` is that of a cell.
+        The scene's box bounds merged nodes, too: a mean lies in the box of its terms.
         """
         step = np.float64(self.base) ** (self.finest + level) / self.space.unit
         edge = np.float64(step) * np.float64(CELL / PARTS)
@@ -162,7 +152,7 @@ class VoxelGrid:
     def sorted_leaves(
         self, center: FloatArray, scale: FloatArray, threads: int, order: Nodes | None = None
     ) -> tuple[Nodes, Offsets]:
-        """Return the splats by level and then along a curve, and where each level ends.
+        """Sort splats by level and then along a curve; return them, and the end of each level in this order.
 
         Args:
             center, scale: (n, 3) of the splats.
@@ -181,14 +171,21 @@ class VoxelGrid:
             keys = keys[order]
         return sort_by_key(keys, order, 3 * CURVE_BITS + len(self.steps).bit_length(), threads)[1], ends
 
+    def keys(self, level: int, rows: FloatArray) -> Keys:
+        """Return (n, words) Morton codes of the cells of a level that node rows are in, the highest word first."""
+        parts, nodes = self.parts(level), np.arange(len(rows), dtype=np.uint32)
+        words = [cell_words(rows, nodes, parts, word) for word in range(self.parts(0).words)]
+        words[0] &= ~np.uint64((1 << 3 * PART_BITS) - 1)
+        return np.stack(words[::-1], axis=1)
+
 
 class NodeRows(NamedTuple):
     """Columns of n nodes without a parent.
 
     Attributes:
         node: (n, WIDTH) float32 node rows of `kernels/pair_merge.py`.
-        number: (n,) uint32 place of a given node among these; of a merged node, where its children begin, as a distance
-            from the end of the final order.
+        number: (n,) uint32 place of a given node among the given ones; of a merged node, the place of its first child
+            as a distance from the end of the final order.
         children: (n,) uint16 number of children merged in this build; 0 for a given node.
     """
 
@@ -197,20 +194,20 @@ class NodeRows(NamedTuple):
     children: NDArray[np.uint16]
 
     def take(self, nodes: Nodes | slice) -> NodeRows:
-        """Return some of the nodes."""
+        """Return nodes by index or slice."""
         return NodeRows(self.node[nodes], self.number[nodes], self.children[nodes])
 
 
 class VoxelTree:
-    """Nodes without a parent, and nodes with one in their final order.
+    """A forest that grows to a tree: rows of its roots, and its other nodes in their final order.
 
-    A node that gets a parent is written at once to its place in the final order, which is filled from its end: the last
-    batch of merges, the coarsest one, comes first there. So a node takes memory in one place at a time.
+    A node that gets a parent moves from its row to its place in the final order. This order is filled from its end, as
+    the last batch of merges, the coarsest, comes first.
 
     Attributes:
-        rows: rows of the nodes without a parent; views of them are invalid after the next call.
+        rows: rows of the roots; a method call may move them, so views of them do not outlive it.
         batches: merges of one level each, in their order: level of the cells; numbers of merged nodes and of their
-            children; (families, words) Morton codes of the cells, the highest word first, empty in memory.
+            children; (families, words) `VoxelGrid.keys` of the merged nodes in a build in stages, else empty.
     """
 
     def __init__(
@@ -221,30 +218,29 @@ class VoxelTree:
         ends: Offsets,
         source: Splats | FloatArray,
         waiting: dict[int, NodeRows] | None = None,
-        keys: Callable[[int, FloatArray], Keys] | None = None,
     ) -> None:
-        """Make a tree without nodes.
+        """Prepare a forest without nodes.
 
         Args:
             leaves: number of given leaves; given nodes with this number or a higher one are merged ones.
-            index: (given,) splat of each given node; splats that join at the level of their size come first, each
-                level along the curve.
-            ends: where each level ends in `index`.
-            source: splats that join, or their (n, WIDTH) node rows, which are freed when all have joined.
-            waiting: rows of all other nodes by the level that they wait for; all nodes in a cell of the level below
-                come from one stage, in their order. It is emptied, so that memory is freed.
-            keys: returns the keys of a batch, by the level and the rows of the merged nodes; None in memory.
+            index: (given,) splat of each given node; first the splats that join at the level of their size, level by
+                level and along the curve.
+            ends: end of each level in `index`.
+            source: the joining splats, or their (n, WIDTH) node rows, freed once all have joined.
+            waiting: rows of all other nodes by the level at which they join; all nodes in a cell of the level below
+                come from one stage, in their order. Emptied, to free memory. None for a build in memory.
         """
         self.batches = list[tuple[int, int, int, Keys]]()
-        self._grid, self._leaves, self._index, self._waiting, self._keys = grid, leaves, index, waiting or {}, keys
+        self._grid, self._leaves, self._index = grid, leaves, index
+        self._in_stages, self._waiting = waiting is not None, waiting or {}
         self._joining = {
             level: slice(begin, end)
             for level, (begin, end) in enumerate(itertools.pairwise([0, *ends.tolist()]))
             if begin < end
         }
         self._source = source if self._joining else None
-        # Twice the nodes are the most that there will be; memory that is not written to is not taken. So much room is
-        # enough for the rows, too: half of them for what the others are merged into.
+        # A tree has at most twice as many nodes as leaves, and untouched memory costs nothing. The rows need as much:
+        # half of them for merged nodes.
         size = 2 * len(index)
         self.rows = NodeRows(np.empty((size, WIDTH), np.float32), np.empty(size, np.uint32), np.empty(size, np.uint16))
         self._used, self._awaited, self._total = 0, len(index), 0
@@ -257,10 +253,10 @@ class VoxelTree:
         """Merge the nodes of each cell, level by level.
 
         Args:
-            margins: of the region of all nodes, at level 0; None if there are no other nodes, and these get one root.
+            margins: of the region, at level 0; None to merge all nodes into one root.
 
         Returns:
-            the nodes without a parent, by the level that they wait for; only the root if there are no margins.
+            the roots, by the level at which they join next.
         """
         grid, active, level = self._grid, np.empty(0, np.uint32), 0
         splats = max((numbers.stop for numbers in self._joining.values()), default=0)
@@ -301,7 +297,7 @@ class VoxelTree:
         return left + list(self._waiting.items())
 
     def _join(self, active: Nodes, more: int) -> tuple[Nodes, slice]:
-        """Add nodes, whose rows are to be filled, and drop inactive ones; return places of active and added nodes."""
+        """Make room for the rows of more nodes; return the places of all active nodes, and those of the new ones."""
         active = self._tidy(active, more)
         part = slice(self._used, self._used + more)
         self._used, self._awaited = part.stop, self._awaited - more
@@ -323,18 +319,18 @@ class VoxelTree:
         rows.children[:] = 0
 
     def _tidy(self, active: Nodes, more: int = 0) -> Nodes:
-        """Make room for more nodes and for the nodes that all merge into; return the places of active nodes."""
+        """Make room for more nodes and for the nodes that all merge into; return the new places of the active nodes."""
         need, size = len(active) + 2 * more, len(self.rows.number)
         if self._used + need <= size and self._used <= 2 * len(active) + more:
             return active
-        # The active nodes move together, in place.
+        # The active nodes move to the front, in place.
         kept = np.zeros(self._used, np.bool_)
         kept[active] = True
         order = np.flatnonzero(kept).astype(np.uint32)
         place = np.empty(self._used, np.uint32)
         place[order] = np.arange(len(order), dtype=np.uint32)
         for part in blocks_of(len(order), MOVED):
-            if order[part][-1] >= part.stop:  # else they are there
+            if order[part][-1] >= part.stop:  # else they are in place
                 for column in self.rows:
                     column[part] = column[order[part]]
         self._used = len(order)
@@ -345,7 +341,7 @@ class VoxelTree:
         return place[active]
 
     def _merge_cells(self, level: int, nodes: Nodes) -> Nodes:
-        """Merge the nodes of each cell, as `kernels.cell_pairs.merge_in_cells`; return the nodes without a parent."""
+        """Merge the nodes of each cell by `kernels.cell_pairs.merge_in_cells`; return the roots."""
         parts = self._grid.parts(level)
         size = LIMIT * (float(parts.step) * (PARTS / CELL))
         largest = np.float32(0.75 * size * size if size < FARTHEST**1.2 else math.inf)  # trace of a covariance
@@ -359,13 +355,14 @@ class VoxelTree:
                 self._write(members)
                 self.rows.number[merged] = self._total - first[:-1]
                 self.rows.children[merged] = np.diff(first)
-                keys = self._keys(level, self.rows.node[merged]) if self._keys else np.empty((0, 0), np.uint64)
+                no_keys = np.empty((0, 0), np.uint64)
+                keys = self._grid.keys(level, self.rows.node[merged]) if self._in_stages else no_keys
                 self.batches.append((level, len(merged), len(members), keys))
                 self._used += len(nodes) // 2
         return survivors
 
     def _write(self, nodes: Nodes) -> None:
-        """Put nodes before all that have been written."""
+        """Write nodes to the final order, before all written so far."""
         end = len(self._weight) - self._total
         part = slice(end - len(nodes), end)
         rows, count = self.rows, len(nodes)
@@ -378,12 +375,12 @@ class VoxelTree:
         self._total += count
 
     def finish(self, tops: NodeRows, given: Splats) -> tuple[Splats, LodTree, Nodes, Nodes]:
-        """Return the nodes as they are drawn: those without a parent, then children of the batches, the last first.
+        """Return the nodes as they are drawn: the roots, then the children of each batch, the last batch first.
 
-        Colours are merged here, where those of siblings are adjacent. The tree is empty afterwards.
+        Merges the colours, as siblings are adjacent only now. Leaves the forest empty.
 
         Args:
-            tops: the nodes without a parent.
+            tops: the roots.
             given: splats, as they are drawn.
 
         Returns:
@@ -410,7 +407,7 @@ class VoxelTree:
             column, filled = getattr(given, name), getattr(out, name)
             width = math.prod(filled.shape[1:])
             fill_leaves(total, number, self._index, column.reshape(len(column), width), filled.reshape(total, width))
-        del given, column  # frees memory if the caller has no reference
+        del given, column  # frees memory unless the caller has a reference
         same, end = np.arange(total, dtype=np.uint32), len(parents)
         for _, families, members, _ in self.batches:
             with threads_for(members):
@@ -422,7 +419,7 @@ class VoxelTree:
 
 
 def plan(bounds: Bounds, sample: Splats, setting: float) -> VoxelGrid:
-    """See `StagedBuilder`; the setting is the base."""
+    """Return the grid of a scene; see `stages.StagedBuilder.plan`. The setting is the base."""
     if not MIN_BASE <= setting <= MAX_BASE:
         raise ValueError(f"base {setting} is not within {MIN_BASE} to {MAX_BASE}")
     corners = np.array([bounds.low, bounds.high])
@@ -435,101 +432,3 @@ def plan(bounds: Bounds, sample: Splats, setting: float) -> VoxelGrid:
     box = (corners / unit).astype(np.float32).astype(np.float64)
     space = Space(np.zeros(3), np.float64(unit))
     return VoxelGrid(setting, finest, steps, bounds.low, bounds.high, box, bounds.largest, space)
-
-
-def leaves(splats: Splats, index: NDArray[np.int64], plan: VoxelGrid) -> Pending:
-    """See `StagedBuilder`; these splats have not joined the tree."""
-    n = len(splats)
-    rows, every = np.empty((n, WIDTH), np.float32), np.arange(n, dtype=np.uint32)
-    columns = SplatColumns(splats.center, splats.scale, splats.quat_xyzw, splats.opacity)
-    fill_leaf_rows(n, every, columns, splats.rgb, plan.space, rows, np.empty(n, np.float32))
-    level, family = np.full(n, NEW, np.int32), np.full(n, NO_FAMILY, np.int64)
-    return Pending.of(splats, rows=rows, level=level, index=index, family=family)
-
-
-def advance(
-    pending: Pending, region: Region | None, stage: int, plan: VoxelGrid, *, progress: Progress = silent
-) -> tuple[StageFamilies, Pending]:
-    """Merge the nodes of cells that no unknown node can be in.
-
-    Families with the same batch and key come from one stage: a stable sort keeps them as they are.
-    """
-    given = dict(pending.columns)
-    del pending
-    with threads_for(len(given["level"])) as threads:
-        tree, pick, ends = _tree(given, plan, threads)
-        margins = Margins(plan.box, float(plan.space.unit), region) if region else None
-        left = tree.grow(margins, progress)
-        tops = NodeRows(*(np.concatenate(columns) for columns in zip(*(rows for _, rows in left), strict=True)))
-        count = len(tops.number)
-        nodes, links, number, parents = tree.finish(tops, Splats(**{name: given[name] for name in COLUMNS}))
-    waits = np.repeat(np.array([level for level, _ in left], np.int32), [len(rows.number) for _, rows in left])
-    family = np.full(len(links), NO_FAMILY, np.int64)
-    is_given = number != MERGED
-    family[is_given] = given["family"][pick[number[is_given]]]
-    family[parents] = (np.int64(stage) << STAGE_BITS) | np.arange(len(parents))
-    # A splat that waits for the level of its own size has not joined.
-    is_new = (tops.children == 0) & (tops.number < (ends[-1] if len(ends) else 0))
-    is_new[is_new] = np.searchsorted(ends, tops.number[is_new], "right") == waits[is_new]
-    index = np.full(count, -1, np.int64)
-    index[is_new] = given["index"][pick[tops.number[is_new]]]
-    drawn = nodes.take(slice(count))
-    handed_on = Pending.of(
-        Splats(**{name: column.copy() for name, column in vars(drawn).items()}),
-        rows=tops.node,
-        level=np.where(is_new, np.int32(NEW), waits),
-        index=index,
-        family=family[:count].copy(),
-    )
-    batches, with_children = tree.batches[::-1], nodes.take(parents)
-    coarse_first = np.array([LEVELS - level for level, *_ in batches], np.int32)
-    families = StageFamilies(
-        batch=np.repeat(coarse_first, [count for _, count, *_ in batches]),
-        key=np.concatenate([*(keys for *_, keys in batches), np.empty((0, plan.parts(0).words), np.uint64)]),
-        count=links.child_count[parents],
-        nodes=nodes.take(slice(count, None)),
-        family=family[count:],
-        center=with_children.center,
-        size=spark_size(with_children),
-    )
-    return families, handed_on
-
-
-def _tree(given: dict[str, NDArray[Any]], grid: VoxelGrid, threads: int) -> tuple[VoxelTree, Nodes, Offsets]:
-    """Return the tree of a stage, the pending node of each number, and where each level ends among the new splats.
-
-    New splats have the first numbers, by level, curve and index, as in memory; then come other splats, then merged
-    ones. The node rows of `given` are removed, so that they are freed when all splats have joined.
-    """
-    is_new = given["level"] == NEW
-    new, old = (np.flatnonzero(mask).astype(np.uint32) for mask in (is_new, ~is_new))
-    index, order = given["index"][new], None
-    if (np.diff(index) < 0).any():
-        order = np.arange(len(new), dtype=np.uint32)
-        order = sort_by_key(index.astype(np.uint64), order, int(index.max()).bit_length(), threads)[1]
-    every = len(old) == 0
-    center, scale = (column if every else column[new] for column in (given["center"], given["scale"]))
-    order, ends = grid.sorted_leaves(center, scale, threads, order)
-    new = new[order]
-    is_merged = given["family"][old] != NO_FAMILY
-    merged = len(old) - int(np.count_nonzero(is_merged))
-    place = old
-    old = np.concatenate([old[~is_merged], old[is_merged]])
-    numbers = np.arange(len(new), len(new) + len(old), dtype=np.uint32)
-    rows: FloatArray = given.pop("rows")
-    survivors = NodeRows(rows[old], numbers, np.zeros(len(old), np.uint16))
-    number = np.empty(len(old), np.uint32)  # among the survivors, of each in the order of the stages
-    number[np.searchsorted(place, old)] = np.arange(len(old), dtype=np.uint32)
-    levels = given["level"][place]
-    waiting = {level: survivors.take(number[levels == level]) for level in np.unique(levels).tolist()}
-    pick = np.concatenate([new, old])
-    tree = VoxelTree(grid, len(new) + merged, pick, ends, rows, waiting, functools.partial(_keys, grid))
-    return tree, pick, ends
-
-
-def _keys(grid: VoxelGrid, level: int, rows: FloatArray) -> Keys:
-    """Return Morton codes of the cells of a level that rows are in, the highest word first."""
-    parts, nodes = grid.parts(level), np.arange(len(rows), dtype=np.uint32)
-    words = [cell_words(rows, nodes, parts, word) for word in range(grid.parts(0).words)]
-    words[0] &= ~np.uint64((1 << 3 * PART_BITS) - 1)
-    return np.stack(words[::-1], axis=1)

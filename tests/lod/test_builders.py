@@ -22,10 +22,11 @@ from sparklod_cli.codecs import spark_nodes
 from sparklod_cli.codecs.reader import check_valid, is_valid_and_visible
 from sparklod_cli.images.metrics import on_background, psnr
 from sparklod_cli.io.reading import read_scene
-from sparklod_cli.lod import quality, quick
+from sparklod_cli.lod import quality, quality_stages, quick, quick_stages
+from sparklod_cli.lod.bounds import check
 from sparklod_cli.lod.kernels.cell_pairs import ROUNDS
 from sparklod_cli.lod.kernels.prune import MOST_CHILDREN, STEPS
-from sparklod_cli.lod.stages import Pending, Region, check
+from sparklod_cli.lod.stages import Region, joined
 from sparklod_cli.lod.tree_settings import BUILDERS, METHODS
 from sparklod_cli.model import selection
 from sparklod_cli.model.gaussian import spark_size
@@ -81,7 +82,7 @@ def build(method: str, splats: Splats, setting: float) -> tuple[Splats, LodTree]
 
 
 def quality_in_stages(splats: Splats, growth: float, splits: list[tuple[int, int, int]]) -> tuple[Splats, LodTree]:
-    nodes, tree, _ = build_in_stages(quality, splats, growth, grid(splats.center, *splits))
+    nodes, tree, _ = build_in_stages(quality_stages, splats, growth, grid(splats.center, *splits))
     check_tree(splats, nodes, tree)
     assert len(nodes) <= max(growth * len(splats), len(splats) + 1)
     return nodes, tree
@@ -113,7 +114,8 @@ def test_threads_do_not_change_a_bit(method: str) -> None:
     builder, splats = import_module(f"sparklod_cli.lod.{method}"), random_splats(MANY[method], sh_degree=1, seed=3)
     division = grid(splats.center, (2, 1, 1))
     check_threads(lambda: builder.build(splats))
-    check_threads(lambda: build_in_stages(builder, splats, 1.4, division)[:2])
+    in_stages = import_module(f"sparklod_cli.lod.{method}_stages")
+    check_threads(lambda: build_in_stages(in_stages, splats, 1.4, division)[:2])
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -131,23 +133,23 @@ def test_invisible_splats_are_an_error(method: str) -> None:
 @pytest.mark.parametrize("value", [1.0, 2.01, math.nan])
 def test_a_setting_out_of_range_is_an_error(method: str, value: float) -> None:
     builder, splats = import_module(f"sparklod_cli.lod.{method}"), random_splats(2)
-    for build_or_plan in (lambda: builder.build(splats, value), lambda: builder.plan(check(splats), splats, value)):
+    plan = import_module(f"sparklod_cli.lod.{method}_stages").plan
+    for build_or_plan in (lambda: builder.build(splats, value), lambda: plan(check(splats), splats, value)):
         with pytest.raises(ValueError, match=BUILDERS[method].setting):
             build_or_plan()
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_region_without_splats_hands_on_nothing(method: str) -> None:
-    builder, splats = import_module(f"sparklod_cli.lod.{method}"), random_splats(50, sh_degree=1, seed=2)
+    builder, splats = import_module(f"sparklod_cli.lod.{method}_stages"), random_splats(50, sh_degree=1, seed=2)
     plan = builder.plan(check(splats), splats, 1.4)
     assert repr(pickle.loads(pickle.dumps(plan))) == repr(plan)  # other processes get it
     nothing = builder.leaves(splats.take(slice(0, 0)), np.arange(0), plan)
     families, left = builder.advance(nothing, Region((0.0,) * 3, (1.0,) * 3), 0, plan, progress=silent)
-    assert len(families) == len(families.nodes) == len(left) == 0
+    assert len(families) == len(families.nodes) == len(left["center"]) == 0
     some = builder.leaves(splats.take(slice(1)), np.arange(1), plan)
     _, one = builder.advance(some, EVERYWHERE, 1, plan, progress=silent)
-    joined = Pending.concat([left, one])
-    assert len(joined) == 1 and joined.columns["sh"].shape == (1, 3, 3)
+    assert joined([left, one])["sh"].shape == (1, 3, 3)
 
 
 # The fast check of a builder's input, beside the definition of a valid and visible splat
@@ -215,7 +217,7 @@ def test_growth_of_a_real_scene_is_no_more_than_that_of_sparks_builder() -> None
 
 def check_stages_of_quick(splats: Splats, base: float, division: Division) -> None:
     """The tree in stages is the tree in memory, bit for bit."""
-    assert same(build_in_stages(quick, splats, base, division)[:2], quick.build(splats, base))
+    assert same(build_in_stages(quick_stages, splats, base, division)[:2], quick.build(splats, base))
 
 
 def clusters(rng: random.Random) -> Splats:
@@ -263,7 +265,7 @@ def test_quick_blocks_hand_on_fewer_nodes_than_they_hold_and_joins_fewer_yet(sh_
     """Small blocks of 5,000 splats, whose merges mostly wait for what is beyond their borders."""
     fat = random_splats(40_000, sh_degree=sh_degree)
     splats = dataclasses.replace(fat, scale=fat.scale * np.float32(0.05))
-    nodes, tree, stages = build_in_stages(quick, splats, 1.5, grid(splats.center, (2, 2, 1), (1, 1, 2)))
+    nodes, tree, stages = build_in_stages(quick_stages, splats, 1.5, grid(splats.center, (2, 2, 1), (1, 1, 2)))
     assert same((nodes, tree), quick.build(splats))
     assert len(stages.families) == 8 + 4 + 1
     blocks = sum(count for stage, count in enumerate(stages.pending) if stage % 3 < 2 and stage < 12)
@@ -272,7 +274,7 @@ def test_quick_blocks_hand_on_fewer_nodes_than_they_hold_and_joins_fewer_yet(sh_
 
 
 def test_families_have_the_centres_and_sizes_of_their_parents() -> None:
-    nodes, tree, stages = build_in_stages(quick, random_splats(2_000), 1.5, WHOLE)
+    nodes, tree, stages = build_in_stages(quick_stages, random_splats(2_000), 1.5, WHOLE)
     (families,) = stages.families
     inner = np.flatnonzero(tree.child_count)
     inner = inner[np.argsort(tree.child_start[inner])]
@@ -411,7 +413,7 @@ def test_coarse_cuts_of_a_single_layer_have_no_cracks(share: float) -> None:
 @pytest.mark.parametrize("growth", GROWTHS)
 def test_one_stage_of_quality_makes_the_tree_in_memory(growth: float) -> None:
     splats = random_splats(2_000, sh_degree=1, seed=1)
-    assert same(build_in_stages(quality, splats, growth, WHOLE)[:2], quality.build(splats, growth))
+    assert same(build_in_stages(quality_stages, splats, growth, WHOLE)[:2], quality.build(splats, growth))
 
 
 @given(
@@ -461,22 +463,22 @@ def test_quality_blocks_use_what_the_growth_allows(growth: float, splits: list[t
 
 def test_quality_blocks_hand_on_few_of_their_nodes() -> None:
     splats = small_splats(40_000)
-    *_, stages = build_in_stages(quality, splats, 1.4, grid(splats.center, (2, 2, 1)))
+    *_, stages = build_in_stages(quality_stages, splats, 1.4, grid(splats.center, (2, 2, 1)))
     assert sum(stages.pending[:4]) < 0.15 * len(splats)
 
 
 def test_the_order_of_tasks_does_not_change_a_bit() -> None:
     """Stages share nothing but what they hand on, and numbers of stages are only in the numbers of families."""
     splats = random_splats(3_000, seed=4)
-    plan = quality.plan(check(splats), splats, 1.4)
+    plan = quality_stages.plan(check(splats), splats, 1.4)
     index = np.flatnonzero(splats.center[:, 0] < 0)
-    region = Region((-np.inf,) * 3, (0.0, np.inf, np.inf))
-    first, again = (
-        quality.advance(quality.leaves(splats.take(index), index, plan), region, stage, plan, progress=silent)
-        for stage in (0, 7)
+    region, pending = (
+        Region((-np.inf,) * 3, (0.0, np.inf, np.inf)),
+        quality_stages.leaves(splats.take(index), index, plan),
     )
-    for name, column in first[1].columns.items():
-        other = again[1].columns[name]
+    first, again = (quality_stages.advance(dict(pending), region, stage, plan, progress=silent) for stage in (0, 7))
+    for name, column in first[1].items():
+        other = again[1][name]
         if name == "family":
             other = np.where(other < 0, other, other - (7 << 32))
         assert column.tobytes() == other.tobytes(), name

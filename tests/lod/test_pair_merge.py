@@ -22,7 +22,7 @@ from sparklod_cli.lod.kernels.pair_merge import (
     WIDTH,
     overlaps,
 )
-from sparklod_cli.lod.pair_tree import BinaryTree, matched, partners
+from sparklod_cli.lod.quality import BinaryTree, matched, partners
 from sparklod_cli.model import falloff
 from sparklod_cli.model.gaussian import MIN_OPACITY, lod_opacity, spark_size
 from tests.references import gaussians

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sparklod_cli.lod import pair_tree
+from sparklod_cli.lod import quality
 from sparklod_cli.lod.kernels import geometry, node_rows, pair_merge, prune
 from sparklod_cli.lod.kernels.geometry import SplatColumns
 from sparklod_cli.lod.kernels.node_rows import merge_colors
@@ -184,11 +184,11 @@ class Binary:
         self.log_size, self.lost, self.weight = self.size.copy(), self.error.copy(), np.empty(leaves - 1, np.float32)
         self.saved = np.ones(leaves - 1, np.int32)
         terms = self.log_size, self.lost, self.weight
-        self.parent = pair_tree.fill_usefulness_terms(self.children, leaves, leaves, total - 1, *terms, blocks)
+        self.parent = quality.fill_usefulness_terms(self.children, leaves, leaves, total - 1, *terms, blocks)
 
     def drop(self, most: int) -> np.ndarray:
         """Drops; returns which are kept, leaves among them."""
-        pair_tree.drop_nodes(
+        quality.drop_nodes(
             self.leaves, most, self.parent, self.log_size, self.lost, self.weight, self.saved, self.blocks
         )
         return np.flatnonzero(self.is_kept)
@@ -261,8 +261,8 @@ def test_the_most_useful_nodes_are_kept() -> None:
         lost = np.array([0.1, 0.1, 1], np.float32)
         lost[worse] = 0.4
         weight, saved = np.empty(3, np.float32), np.ones(3, np.int32)
-        parent = pair_tree.fill_usefulness_terms(children, 4, 4, 6, log_size, lost, weight, 2)
-        pair_tree.drop_nodes(4, 2, parent, log_size, lost, weight, saved, 2)
+        parent = quality.fill_usefulness_terms(children, 4, 4, 6, log_size, lost, weight, 2)
+        quality.drop_nodes(4, 2, parent, log_size, lost, weight, saved, 2)
         assert saved.tolist() == ([-1, 1, 2] if worse == 0 else [1, -1, 2])
 
 
@@ -321,12 +321,12 @@ def test_of_nodes_that_get_their_parents_later_as_many_are_dropped(binary: Binar
     children = binary.children[:made]
     log_size, lost = np.append(binary.size[:total], np.float32(0)), np.ones(made + 1, np.float32)
     weight = np.empty(made + 1, np.float32)
-    parent = pair_tree.fill_usefulness_terms(children, binary.leaves, binary.leaves, total, log_size, lost, weight, 2)
+    parent = quality.fill_usefulness_terms(children, binary.leaves, binary.leaves, total, log_size, lost, weight, 2)
     loose = np.setdiff1d(np.arange(total), children)
     assert np.array_equal(np.flatnonzero(parent[:-1] == total), loose)
     saved = np.ones(made + 1, np.int32)
     saved[-1] = len(loose) - 1 - prune.ROOM
-    pair_tree.drop_nodes(binary.leaves, most + 1, parent, log_size, lost, weight, saved, 2)
+    quality.drop_nodes(binary.leaves, most + 1, parent, log_size, lost, weight, saved, 2)
     assert np.count_nonzero(saved[:-1] >= 0) == min(most, made)
     kept = np.concatenate([np.ones(binary.leaves, bool), saved[:-1] >= 0])
     assert saved[-1] + prune.ROOM + 1 == np.count_nonzero((parent[:-1] == total) & kept)

@@ -15,7 +15,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sparklod_cli.codecs.spark_nodes import Nodes
-from sparklod_cli.lod.stages import NO_FAMILY, STAGE_BITS, Pending, Region, StagedBuilder, StageFamilies, check
+from sparklod_cli.lod.bounds import check
+from sparklod_cli.lod.stages import (
+    NO_FAMILY,
+    STAGE_BITS,
+    Pending,
+    Region,
+    StagedBuilder,
+    StageFamilies,
+    drawn_splats,
+    joined,
+)
 from sparklod_cli.model.foveation import Cones, Frustum
 from sparklod_cli.model.gaussian import MAX_OPACITY, MIN_OPACITY
 from sparklod_cli.model.instances import DetailScene
@@ -230,13 +240,13 @@ class Stages:
 
     def run(self, division: Division, region: Region | None) -> Pending:
         if division.parts:
-            pending = Pending.concat([self.run(part, part.region) for part in division.parts])
+            pending = joined([self.run(part, part.region) for part in division.parts])
         else:
             index = np.flatnonzero(division.contains(self.splats.center))
             pending = self.builder.leaves(self.splats.take(index), index, self.plan)
         families, rest = self.builder.advance(pending, region, len(self.families), self.plan, progress=silent)
         self.families.append(families)
-        self.pending.append(len(rest))
+        self.pending.append(len(rest["center"]))
         return rest
 
 
@@ -246,10 +256,10 @@ def build_in_stages(
     """Build a tree of valid, visible splats, with a block for each of the smallest regions."""
     stages = Stages(builder, builder.plan(check(splats), splats, setting), splats)
     left = stages.run(division, None)
-    assert len(left) == 1
+    assert len(left["center"]) == 1
     for stage, families in enumerate(stages.families):
         check_families(families, stage)
-    return *assemble(stages.families, left.splats, int(left.columns["family"][0])), stages
+    return *assemble(stages.families, drawn_splats(left), int(left["family"][0])), stages
 
 
 def assemble(families: Sequence[StageFamilies], root: Splats, family: int) -> tuple[Splats, LodTree]:

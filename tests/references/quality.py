@@ -128,7 +128,7 @@ def drop_nodes(
     weight: np.ndarray,
     saved: np.ndarray,
 ) -> None:
-    """As `pair_tree.drop_nodes`."""
+    """As `lod.quality.drop_nodes`."""
     root = len(parent) - 1 - leaves
     left, turn, children = root + 1, prune.ROUNDS, prune.MOST_CHILDREN
 
