@@ -19,7 +19,7 @@ from scenes import load
 
 import sparklod_cli as sparklod
 from sparklod_cli import Splats
-from sparklod_cli.codecs import packed_splats, spz
+from sparklod_cli.codecs import layouts, spz
 from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.reader import decode_file
@@ -84,7 +84,7 @@ def paged(way: Way) -> Way:
 
     def read(tree: sparklod.Tree) -> tuple[Splats, int]:
         splats, size = way.read(tree)
-        return packed_splats.unpack(packed_splats.pack(splats, SPARK_RANGES), SPARK_RANGES), size
+        return layouts.unpack_packed(layouts.pack_packed(splats, SPARK_RANGES), SPARK_RANGES), size
 
     return Way(f"{way.name}, in PackedSplats pages", read)
 

@@ -23,7 +23,7 @@ from scenes import load, tiled
 import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import look_at
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.codecs import spark_nodes
+from sparklod_cli.codecs import layouts
 from sparklod_cli.codecs.spark_nodes import Nodes
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
@@ -123,7 +123,7 @@ def tree_of(source: Splats, nodes: int) -> Nodes:
 
 
 def _as_stored(tree: Scene) -> Nodes:
-    return spark_nodes.unpack(sparklod.pack(tree, "lodtree"))
+    return layouts.unpack_nodes(sparklod.pack(tree, "lodtree"))
 
 
 @dataclass(frozen=True)
@@ -246,7 +246,7 @@ def _seconds(work: Callable[[], object]) -> float:
 
 def _give(spark: Spark, nodes: Nodes, file: Path) -> None:
     """Has Spark load a tree."""
-    rows = np.empty(len(nodes.size), spark_nodes.NODE)
+    rows = np.empty(len(nodes.size), layouts.NODE)
     rows["center"], rows["size"] = nodes.center, nodes.size
     rows["child_count"], rows["child_start"] = nodes.tree.child_count, nodes.tree.child_start
     rows.tofile(file)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.framing import COVERED, covered, fitted
-from sparklod_cli.codecs import ext_splats, packed_splats, ply
+from sparklod_cli.codecs import layouts, ply
 from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.spark_codings import SplatEncoding
@@ -349,10 +349,10 @@ def test_through_an_encoding_splats_are_rounded_and_the_cut_stays() -> None:
     assert all(np.array_equal(cut, cuts[0]) for cut in cuts)
     original = scenes[None].loaded[0].splats
     encoding = SplatEncoding(lod_opacity=True)
-    expected = packed_splats.unpack(packed_splats.pack(original, encoding), encoding)
+    expected = layouts.unpack_packed(layouts.pack_packed(original, encoding), encoding)
     assert np.array_equal(scenes["packed"].loaded[0].splats.scale, expected.scale)
     assert expected.opacity.max() > 1
-    expected = ext_splats.unpack(ext_splats.pack(original))
+    expected = layouts.unpack_ext(layouts.pack_ext(original))
     assert np.array_equal(scenes["ext"].loaded[0].splats.quat_xyzw, expected.quat_xyzw)
     # The file is an SPZ already, with other fractional bits.
     rounded = scenes["spz"].loaded[0].splats

@@ -101,16 +101,16 @@ def convert_file(
             size = write_scene(out, form, scene, options, threads=threads, progress=progress)
         else:
             assert layout is not None
-            from ..codecs import array_files
+            from ..codecs import layouts
 
             try:
-                arrays = array_files.pack_layout(scene, layout, threads)
+                arrays = layouts.pack_layout(scene, layout, threads)
             except ValueError:
                 raise FormatError(
                     f"it has no tree, which the layout {layout} consists of; build-lod makes one"
                 ) from None
             with out:
-                size = out.write(out.target.name, array_files.encode_arrays(arrays, raw=settings.suffix != NPZ))
+                size = out.write(out.target.name, layouts.encode_arrays(arrays, raw=settings.suffix != NPZ))
             shapes = {name: words.shape for name, words in arrays.items()}
         ended = time.perf_counter()
     return Converted(

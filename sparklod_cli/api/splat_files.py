@@ -113,13 +113,13 @@ def pack(scene: Scene, encoding: str, *, threads: int | None = None) -> dict[str
         InvalidSplatsError, TreeError: a splat is invalid, or the tree is broken.
         ValueError: there is no such encoding, or the scene has no tree for it.
     """
-    from ..codecs import array_files
+    from ..codecs import layouts
 
     if encoding not in ENCODINGS:
         raise ValueError(f"there is no encoding {encoding!r}; give one of {', '.join(ENCODINGS)}")
     count = thread_count(threads)
     check_valid(scene_like(scene).splats, count)
-    return array_files.pack_layout(scene, encoding, count)
+    return layouts.pack_layout(scene, encoding, count)
 
 
 def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = None) -> Scene:
@@ -132,15 +132,15 @@ def unpack(arrays: Mapping[str, NDArray[np.uint32]], *, threads: int | None = No
         FormatError: an array is missing, or has another shape or type.
         TreeError: the tree is broken.
     """
-    from ..codecs import ext_splats, packed_splats, spark_nodes
+    from ..codecs import layouts
 
     count = thread_count(threads)
-    tree = spark_nodes.unpack(arrays).tree if "lod_tree" in arrays else None
+    tree = layouts.unpack_nodes(arrays).tree if "lod_tree" in arrays else None
     if "packed" in arrays:
         encoding = SplatEncoding(lod_opacity=tree is not None)
-        splats = packed_splats.unpack(arrays, encoding, threads=count)
+        splats = layouts.unpack_packed(arrays, encoding, threads=count)
     else:
-        splats = ext_splats.unpack(arrays, threads=count)
+        splats = layouts.unpack_ext(arrays, threads=count)
     if tree is None:
         return Scene(splats)
     if len(tree) != len(splats):
@@ -288,7 +288,7 @@ def write(
         raise InvalidSplatsError(f"{path}: the scene has no splats to write")
     with progress_callback(progress) as callback, memory_errors_translated():
         if encoding is not None:
-            from ..codecs import array_files
+            from ..codecs import layouts
 
             suffix = path.suffix.lower()
             if suffix not in (NPZ, *RAW_SUFFIXES):
@@ -298,7 +298,7 @@ def write(
             with naming(path, OF_FILES):
                 arrays = pack(scene, encoding, threads=count)
             with out:
-                size = out.write(path.name, array_files.encode_arrays(arrays, raw=suffix in RAW_SUFFIXES))
+                size = out.write(path.name, layouts.encode_arrays(arrays, raw=suffix in RAW_SUFFIXES))
             return Written(path, encoding, size)
         with naming(path, OF_FILES):
             check_valid(scene.splats, count)

@@ -158,7 +158,7 @@ MAX_FRACTIONAL_BITS = 24
 #: Deflate levels, and the default; measured in docs/decisions/05-spz.md.
 MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 
-#: Layouts of `convert --layout`, see `array_files.pack_layout`; docs/formats/memory.md has the arrays of each.
+#: Layouts of `convert --layout`, see `layouts.pack_layout`; docs/formats/memory.md has the arrays of each.
 ENCODINGS = ("packed", "ext", "lodtree", "texture")
 
 #: Layouts after which `spark_nodes.nodes` measures nodes, as Spark does once it has loaded a file: ExtSplats,

@@ -25,6 +25,7 @@ from .encoder import SPZ_RANGES, CodeRange, Tally, tally
 from .formats import WRITABLE, Format
 from .options import WriteOptions
 from .reader import decode_file
+from .spark_codings import SplatEncoding
 
 #: Share of leaves from which on a visible loss of each matters, by column. Measured: with 0.36 % of colours clamped,
 #: pictures of meadow change by up to 36 steps of 255 (61 dB); with 2.4 % of SH, those of playbot by up to 7 (71 dB).
@@ -131,7 +132,7 @@ class LayoutLoss:
     @np.errstate(over="ignore", invalid="ignore")  # of numbers near the end of float32
     def of(cls, splats: Splats) -> LayoutLoss:
         """Return the sums over the valid splats whose losses are finite."""
-        from . import ext_splats, packed_splats
+        from . import layouts
 
         splats = splats.take(
             np.flatnonzero(
@@ -147,8 +148,8 @@ class LayoutLoss:
             moved = np.linalg.norm(held.center.astype(np.float64) - splats.center, axis=1)
             return np.square(opacity) * (changes + _DISPLACED * np.square(np.minimum(1, moved / size)))
 
-        ext = losses(ext_splats.unpack(ext_splats.pack(splats)))
-        packed = losses(packed_splats.unpack(packed_splats.pack(splats)))
+        ext = losses(layouts.unpack_ext(layouts.pack_ext(splats)))
+        packed = losses(layouts.unpack_packed(layouts.pack_packed(splats)))
         weight = np.where(np.isfinite(ext + packed), opacity * size, 0)
         return cls(float(weight.sum()), float(np.nan_to_num(ext) @ weight), float(np.nan_to_num(packed) @ weight))
 
@@ -213,18 +214,18 @@ def after(through: str, file: Path, scene: Scene, threads: int = 1) -> Splats:
 
     Raises `FormatError`, which names the file, if splats are invalid or SPZ cannot hold them.
     """
-    from . import ext_splats, packed_splats
+    from . import layouts
 
     invalid = scene.splats.invalid()
     if invalid:  # of a tree: those of plain files are left out
         raise FormatError(f"{file}: {describe_invalid(invalid)}; no encoding holds such splats")
     try:
         if through == "packed":
-            encoding = packed_splats.of_scene(scene)
-            arrays = packed_splats.pack(scene.splats, encoding, threads=threads)
-            return packed_splats.unpack(arrays, encoding, threads=threads)
+            encoding = SplatEncoding(lod_opacity=scene.tree is not None)
+            arrays = layouts.pack_packed(scene.splats, encoding, threads=threads)
+            return layouts.unpack_packed(arrays, encoding, threads=threads)
         if through == "ext":
-            return ext_splats.unpack(ext_splats.pack(scene.splats, threads=threads), threads=threads)
+            return layouts.unpack_ext(layouts.pack_ext(scene.splats, threads=threads), threads=threads)
         codec = WRITABLE[f".{through}"].codec()
         options = WriteOptions(compression_level=1)  # the bytes live for a moment only, so they need not be small
         data = b"".join(codec.encode(scene, options, threads=threads))

@@ -3,24 +3,19 @@
 The formulas are those of Spark 2.2.0's encoders in Rust, in float32 and in the same order of operations, because the
 last bit decides between two codes. Only functions that libraries round differently (arc cosine, sine, logarithm,
 exponential) are computed in float64 and rounded once, so that every machine gives the same codes.
-
-`exp` and `log` are those of Spark's worker, bit for bit. It is compiled to WebAssembly, which has neither; so both are
-those of Rust's `libm`, after FreeBSD's msun: float32 throughout, and off by less than one unit of the last place, where
-numpy's differ from machine to machine.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..model.gaussian import linear_opacity, lod_opacity
 from ..model.splats import FloatArray
-from ..system.errors import FormatError
 from . import quantize
 
 Words = NDArray[np.uint32]
@@ -29,19 +24,11 @@ Words = NDArray[np.uint32]
 STEPS_8_8_8 = (255, 255)
 STEPS_10_10_12 = (1023, 4095)
 
-#: Units of the last place by which the logarithm, the exponential and the square root of an alpha may miss it together.
-_STEPS_TO_STORED = (0, 1, -1, 2, -2, 3, -3, 4, -4)
-
 _PI = np.float32(np.pi)
 #: Sine of half the angle below which the axis is noise: Spark uses the x axis instead.
 _NO_ROTATION = np.float32(1e-6)
 #: Added before truncation, this rounds ties up; unlike 1 / 2 itself it does not round the float32 below 1 / 2 up to 1.
 ALMOST_HALF = np.nextafter(np.float32(0.5), np.float32(0))
-
-
-def round_half_away(values: FloatArray) -> FloatArray:
-    """Round float32 to whole numbers, ties away from zero, as Rust's `round` does and numpy's does not."""
-    return np.trunc(values + np.copysign(ALMOST_HALF, values))
 
 
 def to_code(values: FloatArray, most: int) -> NDArray[np.uint32]:
@@ -112,109 +99,6 @@ def decode_lod_alpha(alpha: FloatArray) -> FloatArray:
 def lod_opacity_of_alpha(alpha: FloatArray) -> FloatArray:
     """Return the LoD opacity D of Spark's alpha: alpha up to 1, 4 * alpha - 3 above."""
     return np.where(alpha > 1, 4 * alpha - 3, alpha)
-
-
-def stored_lod_alpha(opacity: FloatArray) -> FloatArray:
-    """Return the alpha that linear opacity A was decoded from, to the last bit.
-
-    `encode_lod_alpha` may miss it by some units of the last place, and then another number nearby decodes to A. Where
-    none does, A was not decoded from an alpha, and has that of `encode_lod_alpha`.
-    """
-    alpha = encode_lod_alpha(opacity)
-    left = np.flatnonzero(alpha > 1)  # usually few
-    for steps in _STEPS_TO_STORED:
-        if not left.size:
-            break
-        near = (alpha[left].view(np.int32) + np.int32(steps)).view(np.float32)
-        found = decode_lod_alpha(near) == opacity[left]
-        alpha[left[found]] = near[found]
-        left = left[~found]
-    return alpha
-
-
-def checked_words(arrays: Mapping[str, NDArray[Any]], columns: Mapping[str, int]) -> dict[str, Words]:
-    """Return the arrays of these names, each (N, columns) uint32 with the same N, C-contiguous.
-
-    Raises `FormatError` if an array is missing, or has another shape or type.
-    """
-    found = {}
-    rows = None
-    for name, width in columns.items():
-        array = arrays.get(name)
-        if array is None:
-            raise FormatError(f"there is no array {name}, only {', '.join(arrays) or 'none'}")
-        rows = len(array) if rows is None and array.ndim else rows
-        if array.dtype != np.uint32 or array.shape != (rows, width):
-            raise FormatError(f"{name} is {array.dtype}{list(array.shape)}, expected uint32[{rows}, {width}]")
-        found[name] = np.ascontiguousarray(array)
-    return found
-
-
-_ONE, _TWO, _HALF = np.float32(1), np.float32(2), np.float32(0.5)
-
-#: ln 2 in two parts, the first of which has few enough bits that its multiples by whole exponents are exact: msun has a
-#: pair for each function.
-_EXP_LN2: Final = np.float32(6.9314575195e-1), np.float32(1.4286067653e-6)
-_LOG_LN2: Final = np.float32(6.9313812256e-1), np.float32(9.0580006145e-6)
-_PER_LN2 = np.float32(1.4426950216)
-
-#: Coefficients of r / 2 * (exp(r) + 1) / (exp(r) - 1) in r ** 2, for abs(r) up to ln(2) / 2.
-_EXP_COEFFICIENTS: Final = np.float32(1.6666625440e-1), np.float32(-2.7667332906e-3)
-#: Coefficients of (ln(1 + s) - ln(1 - s)) / s - 2 in s ** 2.
-_LOG_COEFFICIENTS: Final = tuple(map(np.float32, (0.66666662693, 0.40000972152, 0.28498786688, 0.24279078841)))
-
-#: Magnitudes up to which exp takes no multiple of ln 2, and up to which it takes one: ln(2) / 2 and 1.5 ln(2), as the
-#: bits that msun compares.
-_NO_MULTIPLE, _ONE_MULTIPLE = np.array([0x3EB17218, 0x3F851592], np.uint32).view(np.float32)
-
-#: Numbers whose exponentials are 0 and infinity, as are those beyond them.
-_BEYOND: Final = np.float32(-120), np.float32(100)
-
-#: Mantissas are taken from sqrt(1 / 2) to sqrt(2): the bits of the former, and its distance from those of 1.
-_SQRT_HALF, _ONE_BITS = 0x3F3504F3, 0x3F800000
-#: Subnormal numbers are scaled by 2 to this first.
-_SUBNORMAL = 25
-
-
-@np.errstate(over="ignore", under="ignore", invalid="ignore")
-def exp(values: FloatArray) -> FloatArray:
-    """Compute e ** values, float32; infinity above 88.7, 0 below -104."""
-    values = np.clip(values, *_BEYOND)
-    magnitude = np.abs(values)
-    one_or_none = np.where(magnitude > _NO_MULTIPLE, np.copysign(_ONE, values), np.float32(0))
-    several = np.trunc(_PER_LN2 * values + np.copysign(_HALF, values))
-    multiple = np.where(magnitude > _ONE_MULTIPLE, several, one_or_none)
-    high, low = values - multiple * _EXP_LN2[0], multiple * _EXP_LN2[1]
-    rest = high - low
-    square = rest * rest
-    first, second = _EXP_COEFFICIENTS
-    curve = rest - square * (first + square * second)
-    mantissa = _ONE + (rest * curve / (_TWO - curve) - low + high)
-    found: FloatArray = np.ldexp(mantissa, np.nan_to_num(multiple).astype(np.int32))
-    return found
-
-
-@np.errstate(over="ignore", divide="ignore", invalid="ignore")
-def log(values: FloatArray) -> FloatArray:
-    """Compute natural logarithms, float32; minus infinity for 0, NaN below it."""
-    subnormal = values < np.finfo(np.float32).tiny
-    scaled = np.where(subnormal, values * np.float32(2**_SUBNORMAL), values)
-    bits = scaled.view(np.int32) + np.int32(_ONE_BITS - _SQRT_HALF)
-    exponent = ((bits >> 23) - 127 - np.where(subnormal, _SUBNORMAL, 0)).astype(np.float32)
-    mantissa: NDArray[Any] = ((bits & 0x7FFFFF) + np.int32(_SQRT_HALF)).view(np.float32)
-    over_one = mantissa - _ONE
-    s = over_one / (_TWO + over_one)
-    z = s * s
-    w = z * z
-    l1, l2, l3, l4 = _LOG_COEFFICIENTS
-    series = z * (l1 + w * l3) + w * (l2 + w * l4)
-    half_square = _HALF * over_one * over_one
-    found: FloatArray = (
-        s * (half_square + series) + exponent * _LOG_LN2[1] - half_square + over_one + exponent * _LOG_LN2[0]
-    )
-    special = ~((values > 0) & (values < np.inf))
-    found[special] = np.log(values[special])
-    return found
 
 
 #: Scales below this are encoded as 0: e ** -30.
@@ -309,8 +193,8 @@ def encode_log_scale(
     """Encode linear scales: 0 for scales below e ** -30, 1..255 for logarithms from low to high.
 
     Args:
-        log: of Spark's worker, `spark_codings.log`, or rounded once.
-        least: scales below it are 0.
+        log: natural logarithm: `spark_nodes.log`, that of Spark's worker, or one that is rounded once.
+        least: smallest scale that is not encoded as 0.
     """
     first = np.float32(low)
     width = np.float32(high) - first

@@ -1,38 +1,111 @@
-"""Nodes of a Level-of-Detail tree as Spark's traversal reads them: its layout of 16 bytes per node, and loaded nodes.
+"""Nodes of a Level-of-Detail tree as Spark's traversal has them, measured after Spark's own coding of the splats.
 
-Loaded nodes are measured after Spark's own coding of the splats: it decodes a file to float32, codes the splats as
-ExtSplats or PackedSplats, decodes those, and takes of them centres and sizes, which it rounds to half floats. All of
-that is repeated here in the same arithmetic, for the columns that matter.
+Spark decodes a file to float32, encodes the splats as ExtSplats or PackedSplats, decodes those, measures centres and
+sizes, and rounds them to half floats. All of that is repeated here in the same arithmetic, for the columns that matter.
+
+`exp` and `log` are those of Spark's worker, bit for bit. It is compiled to WebAssembly, which has neither; so both are
+those of Rust's `libm`, after FreeBSD's msun: float32 throughout, and off by less than one unit of the last place, where
+numpy's differ from machine to machine.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..model.gaussian import size_factor, spark_size
-from ..model.lod_tree import CHUNK_NODES, MAX_CHILDREN, LodTree
+from ..model.gaussian import size_factor
+from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import SPZ_SCALES, FileCoding, ScaleCoding
 from ..model.splats import FloatArray, Splats
-from ..system.errors import FormatError
 from ..system.threads import for_blocks
 from . import quantize, spark_codings
-from .spark_codings import SplatEncoding, Words, checked_words
+from .spark_codings import SplatEncoding
 
-NODE = np.dtype(
-    [
-        ("center", "<f2", 3),  # 0: world units; x | y << 16 in word 0, z in word 1
-        ("size", "<f2"),  # 6: world units, see `spark_size`; the upper half of word 1
-        ("child_count", "<u4"),  # 8: 0 for a leaf; a uint16, the upper half of word 2 is 0
-        ("child_start", "<u4"),  # 12: index of the first child, 0 for a leaf
-    ]
-)
-assert NODE.itemsize == 16
+_ONE, _TWO, _HALF = np.float32(1), np.float32(2), np.float32(0.5)
+
+#: ln 2 in two parts, the first of which has few enough bits that its multiples by whole exponents are exact: msun has a
+#: pair for each function.
+_EXP_LN2: Final = np.float32(6.9314575195e-1), np.float32(1.4286067653e-6)
+_LOG_LN2: Final = np.float32(6.9313812256e-1), np.float32(9.0580006145e-6)
+_PER_LN2 = np.float32(1.4426950216)
+
+#: Coefficients of r / 2 * (exp(r) + 1) / (exp(r) - 1) in r ** 2, for abs(r) up to ln(2) / 2.
+_EXP_COEFFICIENTS: Final = np.float32(1.6666625440e-1), np.float32(-2.7667332906e-3)
+#: Coefficients of (ln(1 + s) - ln(1 - s)) / s - 2 in s ** 2.
+_LOG_COEFFICIENTS: Final = tuple(map(np.float32, (0.66666662693, 0.40000972152, 0.28498786688, 0.24279078841)))
+
+#: Magnitudes up to which exp takes no multiple of ln 2, and up to which it takes one: ln(2) / 2 and 1.5 ln(2), as the
+#: bits that msun compares.
+_NO_MULTIPLE, _ONE_MULTIPLE = np.array([0x3EB17218, 0x3F851592], np.uint32).view(np.float32)
+
+#: Numbers whose exponentials are 0 and infinity, as are those beyond them.
+_BEYOND: Final = np.float32(-120), np.float32(100)
+
+#: Mantissas are taken from sqrt(1 / 2) to sqrt(2): the bits of the former, and its distance from those of 1.
+_SQRT_HALF, _ONE_BITS = 0x3F3504F3, 0x3F800000
+#: Subnormal numbers are scaled by 2 to this first.
+_SUBNORMAL = 25
+
+
+@np.errstate(over="ignore", under="ignore", invalid="ignore")
+def exp(values: FloatArray) -> FloatArray:
+    """Compute e ** values, float32; infinity above 88.7, 0 below -104."""
+    values = np.clip(values, *_BEYOND)
+    magnitude = np.abs(values)
+    one_or_none = np.where(magnitude > _NO_MULTIPLE, np.copysign(_ONE, values), np.float32(0))
+    several = np.trunc(_PER_LN2 * values + np.copysign(_HALF, values))
+    multiple = np.where(magnitude > _ONE_MULTIPLE, several, one_or_none)
+    high, low = values - multiple * _EXP_LN2[0], multiple * _EXP_LN2[1]
+    rest = high - low
+    square = rest * rest
+    first, second = _EXP_COEFFICIENTS
+    curve = rest - square * (first + square * second)
+    mantissa = _ONE + (rest * curve / (_TWO - curve) - low + high)
+    found: FloatArray = np.ldexp(mantissa, np.nan_to_num(multiple).astype(np.int32))
+    return found
+
+
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
+def log(values: FloatArray) -> FloatArray:
+    """Compute natural logarithms, float32; minus infinity for 0, NaN below it."""
+    subnormal = values < np.finfo(np.float32).tiny
+    scaled = np.where(subnormal, values * np.float32(2**_SUBNORMAL), values)
+    bits = scaled.view(np.int32) + np.int32(_ONE_BITS - _SQRT_HALF)
+    exponent = ((bits >> 23) - 127 - np.where(subnormal, _SUBNORMAL, 0)).astype(np.float32)
+    mantissa: NDArray[Any] = ((bits & 0x7FFFFF) + np.int32(_SQRT_HALF)).view(np.float32)
+    over_one = mantissa - _ONE
+    s = over_one / (_TWO + over_one)
+    z = s * s
+    w = z * z
+    l1, l2, l3, l4 = _LOG_COEFFICIENTS
+    series = z * (l1 + w * l3) + w * (l2 + w * l4)
+    half_square = _HALF * over_one * over_one
+    found: FloatArray = (
+        s * (half_square + series) + exponent * _LOG_LN2[1] - half_square + over_one + exponent * _LOG_LN2[0]
+    )
+    special = ~((values > 0) & (values < np.inf))
+    found[special] = np.log(values[special])
+    return found
+
+
+Recode = Callable[[FloatArray], FloatArray]
+
+#: Every half float.
+_HALVES = np.arange(1 << 16, dtype=np.uint16).view(np.float16)
+
+#: Spark's worker codes no other scales as 0 than those below this; its documentation says e ** -30.
+_LEAST = np.finfo(np.float32).smallest_subnormal
+
+#: Share of a scale by which it may differ from that of its code: several times what exponentials disagree by.
+_SAME = np.float32(2**-20)
+
+#: Units of the last place by which the logarithm, the exponential and the square root of an alpha may miss it together.
+_STEPS_TO_STORED = (0, 1, -1, 2, -2, 3, -3, 4, -4)
 
 
 @dataclass(frozen=True)
@@ -65,115 +138,77 @@ class Nodes:
         rows["child_start"], rows["child_count"] = self.tree.first_child(), self.tree.child_count
 
 
-def pack(splats: Splats, tree: LodTree, *, threads: int = 1) -> dict[str, Words]:
-    """Pack splats and their tree in the layout of Spark's traversal: "lod_tree" (N, 4) uint32.
-
-    Spark measures splats after their coding: for the same words as Spark's, pass splats that were packed and unpacked
-    by `ext_splats` or `packed_splats`. A coordinate or a size of 65520 or more becomes infinite, as in Spark.
-
-    Raises:
-        FormatError: the numbers of nodes and splats differ.
-    """
-    if len(tree) != len(splats):
-        raise FormatError(f"{len(tree):,} nodes, but {len(splats):,} splats")
-    words = np.empty((len(splats), 4), np.uint32)
-
-    @np.errstate(over="ignore")
-    def encode(part: slice) -> None:
-        rows = words[part].view(NODE)[:, 0]
-        rows["center"] = splats.center[part]
-        rows["size"] = spark_size(splats.take(part))
-        rows["child_count"] = tree.child_count[part]
-        rows["child_start"] = tree.child_start[part]
-
-    for_blocks(encode, len(splats), threads)
-    return {"lod_tree": words}
-
-
-def unpack(arrays: Mapping[str, NDArray[Any]]) -> Nodes:
-    """Return the nodes of the array of `pack`.
-
-    Largest errors: 2 ** -11 of each coordinate and of the size, or 2 ** -25 if that is more; children are exact.
-
-    Raises:
-        FormatError: the array is missing or has another shape or type, or a node has more children than a uint16 holds.
-    """
-    rows = checked_words(arrays, {"lod_tree": 4})["lod_tree"].view(NODE)[:, 0]
-    child_count = rows["child_count"]
-    if child_count.max(initial=0) > MAX_CHILDREN:
-        node = int(np.argmax(child_count > MAX_CHILDREN))
-        raise FormatError(f"node {node} has {child_count[node]:,} children, a uint16 holds at most {MAX_CHILDREN:,}")
-    tree = LodTree(child_count.astype(np.uint16), rows["child_start"].copy())
-    return Nodes(rows["center"].astype(np.float32), rows["size"].astype(np.float32), tree)
-
-
-Recode = Callable[[FloatArray], FloatArray]
-
-#: Every half float.
-_HALVES = np.arange(1 << 16, dtype=np.uint16).view(np.float16)
-
-#: Spark's worker codes no other scales as 0 than those below this; its documentation says e ** -30.
-_LEAST = np.finfo(np.float32).smallest_subnormal
-
-#: Share of a scale by which it may differ from that of its code: several times what exponentials disagree by.
-_SAME = np.float32(2**-20)
-
-
 def nodes(splats: Splats, tree: LodTree, layout: str, coding: FileCoding | None = None, *, threads: int = 1) -> Nodes:
     """Return the nodes of a tree as Spark's traversal reads them.
 
     Args:
-        splats: N, as they were decoded; their centres, scales and opacities matter.
+        splats: N decoded splats; their centres, scales and opacities matter.
         layout: one of `formats.LOADED`.
-        coding: of the file that they were read from. Scales that do not come from its codes, or of splats that were not
-            read from a file, are taken to be those that Spark has.
+        coding: coding of their file. Scales that do not come from its codes, and all scales of splats without a file,
+            are taken to be those that Spark has.
     """
     coding = coding or FileCoding()
-    alpha_held, scale_held = _layout(layout, coding.packed_range)
-    found = Nodes(np.empty((len(splats), 3), np.float32), np.empty(len(splats), np.float32), tree)
+    round_alpha, round_scale = _rounding(layout, coding.packed_range)
+    measured = Nodes(np.empty((len(splats), 3), np.float32), np.empty(len(splats), np.float32), tree)
     for rows, scales in coding.parts(len(splats)):
-        recode = _recoded(scales, scale_held)
+        recode = _recoded(scales, round_scale)
 
         @np.errstate(over="ignore", invalid="ignore")
         def measure(part: slice, start: int = rows.start, recode: Recode = recode) -> None:
             part = slice(start + part.start, start + part.stop)
-            alpha = alpha_held(spark_codings.stored_lod_alpha(splats.opacity[part]))
+            alpha = round_alpha(stored_lod_alpha(splats.opacity[part]))
             x, y, z = recode(np.ascontiguousarray(splats.scale[part].T))
             factor = np.float32(2) * size_factor(spark_codings.lod_opacity_of_alpha(alpha))
-            found.center[part] = splats.center[part].astype(np.float16)
-            found.size[part] = (factor * ((x + y + z) / np.float32(3))).astype(np.float16)
+            measured.center[part] = splats.center[part].astype(np.float16)
+            measured.size[part] = (factor * ((x + y + z) / np.float32(3))).astype(np.float16)
 
         for_blocks(measure, rows.stop - rows.start, threads)
-    return found
+    return measured
 
 
-def _layout(name: str, packed_range: tuple[float, float] | None) -> tuple[Recode, Recode]:
-    """Return the rounding of alphas, 0..2, and of linear scales in one of `formats.LOADED`.
+def stored_lod_alpha(opacity: FloatArray) -> FloatArray:
+    """Return the alpha from which linear opacity A was decoded, to the last bit.
+
+    `encode_lod_alpha` may miss it by some units of the last place, and then another number nearby decodes to A. Where
+    no number does, A was not decoded from an alpha, and the alpha of `encode_lod_alpha` is returned.
+    """
+    alpha = spark_codings.encode_lod_alpha(opacity)
+    left = np.flatnonzero(alpha > 1)  # usually few
+    for steps in _STEPS_TO_STORED:
+        near = (alpha[left].view(np.int32) + np.int32(steps)).view(np.float32)
+        is_same = spark_codings.decode_lod_alpha(near) == opacity[left]
+        alpha[left[is_same]] = near[is_same]
+        left = left[~is_same]
+    return alpha
+
+
+def _rounding(layout: str, packed_range: tuple[float, float] | None) -> tuple[Recode, Recode]:
+    """Return the functions that round alphas, 0..2, and linear scales as one of `formats.LOADED` does.
 
     Args:
         packed_range: range of logarithms that a file sets for PackedSplats; None for that of Spark.
     """
-    if name == "ext":
-        scales = spark_codings.exp(_HALVES.astype(np.float32))
+    if layout == "ext":
+        scales = exp(_HALVES.astype(np.float32))
         return (
             lambda alpha: alpha.astype(np.float16).astype(np.float32),
-            lambda scale: scales[spark_codings.log(scale).astype(np.float16).view(np.uint16)],
+            lambda scale: scales[log(scale).astype(np.float16).view(np.uint16)],
         )
     own = SplatEncoding(lod_opacity=True)
     low, high = own.ln_scale_min, own.ln_scale_max
-    if name == "packed" and packed_range is not None:
+    if layout == "packed" and packed_range is not None:
         low, high = packed_range
-    table = spark_codings.log_scale_table(low, high, exp=spark_codings.exp)
+    table = spark_codings.log_scale_table(low, high, exp=exp)
 
-    def alpha_held(alpha: FloatArray) -> FloatArray:
+    def round_alpha(alpha: FloatArray) -> FloatArray:
         codes = spark_codings.encode_linear(alpha, 0, own.alpha_max)
         return spark_codings.decode_linear(codes.astype(np.uint8), 0, own.alpha_max)
 
-    def scale_held(scale: FloatArray) -> FloatArray:
+    def round_scale(scale: FloatArray) -> FloatArray:
         known = np.where(np.isnan(scale), _LEAST, scale)
-        return table[spark_codings.encode_log_scale(known, low, high, log=spark_codings.log, least=_LEAST)]
+        return table[spark_codings.encode_log_scale(known, low, high, log=log, least=_LEAST)]
 
-    return alpha_held, scale_held
+    return round_alpha, round_scale
 
 
 @np.errstate(divide="ignore", invalid="ignore")
@@ -182,31 +217,31 @@ def _half_log(scale: FloatArray) -> NDArray[np.uint16]:
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _recoded(coding: ScaleCoding, held: Recode) -> Recode:
-    """Return what a layout keeps (`held`) of scales that come from codes, whose last bits are others in Spark."""
+def _recoded(coding: ScaleCoding, round_scale: Recode) -> Recode:
+    """Return a function that rounds scales decoded from codes as Spark does, which decodes them to other last bits."""
     code_of: Callable[[FloatArray], NDArray[Any]]
     name, low, high = coding
     if name == "ln_0r8":
         code_of = functools.partial(spark_codings.encode_log_scale, low=low, high=high)
-        scale_of = spark_codings.log_scale_table(low, high)
-        theirs = spark_codings.log_scale_table(low, high, exp=spark_codings.exp)
+        ours = spark_codings.log_scale_table(low, high)
+        theirs = spark_codings.log_scale_table(low, high, exp=exp)
     elif coding == SPZ_SCALES or name == "ln_f16":
         logs: NDArray[Any] = _HALVES.astype(np.float32)
         code_of = _half_log
         if coding == SPZ_SCALES:
             logs = np.arange(256, dtype=np.float32) / quantize.SCALE_STEPS - quantize.SCALE_OFFSET
             code_of = quantize.encode_log_scale
-        scale_of, theirs = np.exp(logs), spark_codings.exp(logs)
+        ours, theirs = np.exp(logs), exp(logs)
     else:
-        return held
-    of_code = held(theirs)
+        return round_scale
+    rounded_of_code = round_scale(theirs)
 
     def of_scale(scale: FloatArray) -> FloatArray:
         code = code_of(scale)
-        found, ours = of_code[code], scale_of[code]
-        other = ~((ours == scale) | (np.abs(ours - scale) <= _SAME * scale))
+        rounded, decoded = rounded_of_code[code], ours[code]
+        other = ~((decoded == scale) | (np.abs(decoded - scale) <= _SAME * scale))
         if other.any():
-            found[other] = held(scale[other])
-        return found
+            rounded[other] = round_scale(scale[other])
+        return rounded
 
     return of_scale

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..codecs import data_texture, ext_splats, packed_splats, spark_nodes
-from ..codecs.array_files import Arrays
+from ..codecs import layouts
 from ..codecs.formats import RAD
 from ..codecs.rad.rad_reader import RadReader, fits
 from ..codecs.reader import code_of
@@ -295,17 +294,19 @@ def _container_findings(scene: Scene) -> list[Finding]:
 NO_CHILDREN = "its splats are the nodes of a tree, but it has no child indices, so leaves cannot be told apart"
 
 
-def _of_arrays(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) -> tuple[dict[str, Any], Scene | None]:
+def _of_arrays(
+    arrays: layouts.Arrays, settings: ReportSettings, *, threads: int = 1
+) -> tuple[dict[str, Any], Scene | None]:
     """Return the fields of a report on the arrays of one of `codecs.formats.ENCODINGS`, and the splats if complete."""
     fields: dict[str, Any] = {"sh_degree": 0, "antialiased": False, "findings": []}
     scene: Scene | None = None
     if "packed" in arrays or "ext0" in arrays:
         if "packed" in arrays:
             # build-lod writes trees, for which Spark stores LoD opacities; the file does not record that.
-            splats = packed_splats.unpack(arrays, SplatEncoding(lod_opacity=True), threads=threads)
+            splats = layouts.unpack_packed(arrays, SplatEncoding(lod_opacity=True), threads=threads)
             scene = Scene(splats, format="NPZ of PackedSplats")
         else:
-            splats = ext_splats.unpack(arrays, threads=threads)
+            splats = layouts.unpack_ext(arrays, threads=threads)
             scene = Scene(splats, format="NPZ of ExtSplats")
         form, count, note, fields["sh_degree"] = scene.format, len(splats), NO_CHILDREN, splats.sh_degree
         if settings.values:
@@ -314,7 +315,7 @@ def _of_arrays(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) ->
             opaque = dataclasses.replace(splats, opacity=np.minimum(splats.opacity, np.float32(1)))
             fields["findings"] = values.check(Scene(opaque))
     elif "lod_tree" in arrays:
-        nodes = spark_nodes.unpack(arrays)
+        nodes = layouts.unpack_nodes(arrays)
         form, count = "NPZ of LodTree", len(nodes.tree)
         note = "it has centres, sizes and children of nodes, but no opacities, colours and shapes"
         if count:
@@ -327,7 +328,7 @@ def _of_arrays(arrays: Arrays, settings: ReportSettings, *, threads: int = 1) ->
         else:
             fields["findings"] = [Finding("values.empty", "there are no splats")]
     elif "texture" in arrays:
-        capacity = data_texture.capacity(arrays)
+        capacity = layouts.texture_capacity(arrays)
         used = np.flatnonzero(np.ascontiguousarray(arrays["texture"]).reshape(capacity, 8).any(axis=1))
         form, count = "NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0
         note = "it has centres, covariances and colours of nodes, but no opacities above 1, SH and children"

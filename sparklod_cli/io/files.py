@@ -38,7 +38,7 @@ from ..system.stdio import DASH, spooled
 from ..system.untrusted import decoded_text, near, quoted_value
 
 if TYPE_CHECKING:
-    from ..codecs import array_files
+    from ..codecs import layouts
     from ..codecs.rad.rad_reader import RadReader
 
 #: Names in a folder that are compared with a missing one (comparing more delays the error noticeably), and least
@@ -180,14 +180,14 @@ def readable() -> Iterator[None]:
         raise UnreadableError(f"cannot be read: {reason_unreadable(error)}") from None
 
 
-def read_arrays(path: Path) -> array_files.Arrays | None:
+def read_arrays(path: Path) -> layouts.Arrays | None:
     """Read the arrays of a .npz file; return None for a file of another format, or one that cannot be opened."""
-    from ..codecs import array_files
+    from ..codecs import layouts
 
     try:
         if path == DASH or path.is_file():
             with file_of(path) as file:
-                return array_files.decode_npz(file) if file.read(len(ZIP)) == ZIP else None
+                return layouts.decode_npz(file) if file.read(len(ZIP)) == ZIP else None
     except (OSError, UnreadableError):
         pass
     return None
@@ -369,9 +369,9 @@ def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
         rows: the splats whose values are read; None for all.
 
     Returns:
-        (N, 4) float32, see `array_files.decode_rgba`.
+        (N, 4) float32, see `layouts.decode_rgba`.
     """
-    from ..codecs import array_files
+    from ..codecs import layouts
 
     try:
         if path.exists() and not path.is_file():
@@ -380,7 +380,7 @@ def read_rgba(path: Path, count: int, rows: slice | None = None) -> FloatArray:
             if is_pointer(file.read(SHORT)):
                 raise FormatError(f"cannot be read: it is {POINTER}")
             file.seek(0)
-            return array_files.decode_rgba(file, count, rows)
+            return layouts.decode_rgba(file, count, rows)
     except OSError as error:
         raise FormatError(f"{path} cannot be read: {reason_unreadable(error)}") from None
     except FormatError as error:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import Camera
-from ..codecs import data_texture
+from ..codecs import layouts
 from ..model.falloff import HALF_LOG2E, LEAST_EXPONENT, LEAST_REST, MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
@@ -608,20 +608,20 @@ class Floats(DataTexture):
 
 
 class Halves(DataTexture):
-    """Two texels per splat, in the layout of antimatter15's viewer: `codecs.data_texture`.
+    """Two texels per splat, in the layout of antimatter15's viewer: `codecs.layouts`.
 
     A byte cannot store the opacity of a merged splat, nor a colour above 1. So the word that the viewer leaves unused
     holds two float16: D, and a factor for the colour bytes, usually 1.
     """
 
-    texels_a_splat, splats_a_row = 2, data_texture.SPLATS_A_ROW
+    texels_a_splat, splats_a_row = 2, layouts.SPLATS_A_ROW
 
     def _geometry(self, shaded: ShadedSplats) -> None:
         colorless = np.zeros_like(shaded.rgb)
         sh = np.zeros((len(shaded), COEFFICIENTS[0], 3), np.float32)
         opacity = np.minimum(shaded.lod_opacity, 1)
         splats = Splats(shaded.center, shaded.scale, shaded.quat_xyzw, opacity, colorless, sh)
-        self.texture = data_texture.pack(splats)["texture"]
+        self.texture = layouts.pack_texture(splats)["texture"]
         self._extra(shaded)[:, 0] = shaded.lod_opacity
 
     def _colors(self, shaded: ShadedSplats) -> None:
@@ -629,7 +629,7 @@ class Halves(DataTexture):
         gain = np.maximum(rgb.max(axis=1, initial=0), 1).astype(np.float16)
         # float16 may round the factor down, and a byte must not overflow.
         bright = np.minimum(rgb / gain[:, None].astype(np.float32), 1)
-        self._rows(data_texture.SPLAT, len(shaded))["rgba"][:, :3] = np.rint(bright * 255)
+        self._rows(layouts.TEXELS, len(shaded))["rgba"][:, :3] = np.rint(bright * 255)
         self._extra(shaded)[:, 1] = gain
 
     def _extra(self, shaded: ShadedSplats) -> NDArray[np.float16]:

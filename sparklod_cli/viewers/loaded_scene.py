@@ -322,12 +322,14 @@ def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
 
 def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding | None, *, precision: str, threads: int) -> Nodes:
     """Return nodes as a traversal reads them, in one of `codecs.formats.PRECISIONS`."""
-    from ..codecs import spark_nodes
+    from ..codecs import layouts, spark_nodes
 
     if precision == "float32":
         return spark_nodes.Nodes(splats.center, spark_size(splats), tree)
     if precision == "float16":
-        return spark_nodes.unpack(spark_nodes.pack(splats, tree, threads=threads))
+        from ..codecs import layouts
+
+        return layouts.unpack_nodes(layouts.pack_nodes(splats, tree, threads=threads))
     return spark_nodes.nodes(splats, tree, precision, coding, threads=threads)
 
 

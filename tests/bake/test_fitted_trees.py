@@ -16,7 +16,7 @@ from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
 from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import spark_nodes
+from sparklod_cli.codecs import layouts
 from sparklod_cli.codecs.formats import WRITABLE
 from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.spark_codings import SplatEncoding
@@ -300,8 +300,8 @@ def test_every_format_holds_a_fitted_tree(folder: Path, fitted: Scene, name: str
 @pytest.mark.parametrize("share", SHARES)
 def test_cuts_of_a_fitted_tree_spend_their_budget(fitted: Scene, share: float) -> None:
     assert fitted.tree is not None
-    packed = spark_nodes.pack(fitted.splats, fitted.tree, threads=1)
-    viewer, budget = SparkViewer(Forest([spark_nodes.unpack(packed)]), [TreeInstance()]), int(share * COUNT)
+    packed = layouts.pack_nodes(fitted.splats, fitted.tree, threads=1)
+    viewer, budget = SparkViewer(Forest([layouts.unpack_nodes(packed)]), [TreeInstance()]), int(share * COUNT)
     for eye in ((0.0, 0.0, -6.0), (3.0, -1.0, 2.0)):
         cut = viewer.cut(Camera.look_at(eye, (0, 0, 0)), budget=budget)
         drawn = sum(map(len, cut.indices()))

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sparklod_cli.codecs import array_files, data_texture, ext_splats, packed_splats, spark_nodes
+from sparklod_cli.codecs import layouts
 from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.codecs.losses import SAMPLE, LayoutLoss, sample_loss
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
@@ -45,14 +45,14 @@ EXT: Layout = None
 
 def pack(splats: Splats, layout: Layout = DEFAULT, threads: int = 1) -> dict[str, np.ndarray]:
     if layout is EXT:
-        return ext_splats.pack(splats, threads=threads)
-    return packed_splats.pack(splats, layout, threads=threads)
+        return layouts.pack_ext(splats, threads=threads)
+    return layouts.pack_packed(splats, layout, threads=threads)
 
 
 def unpack(words: dict[str, np.ndarray], layout: Layout = DEFAULT, threads: int = 1) -> Splats:
     if layout is EXT:
-        return ext_splats.unpack(words, threads=threads)
-    return packed_splats.unpack(words, layout, threads=threads)
+        return layouts.unpack_ext(words, threads=threads)
+    return layouts.unpack_packed(words, layout, threads=threads)
 
 
 def round_trip(splats: Splats, layout: Layout = DEFAULT) -> Splats:
@@ -108,7 +108,7 @@ def word(r: int, g: int, b: int, signs: int, exponent: int) -> int:
     ],
 )
 def test_a_word_of_sh_in_ext_splats_is_that_worked_out_by_hand(rgb: list[float], expected: int) -> None:
-    assert ext_splats.encode_sh(np.array([[rgb]], np.float32)).tolist() == [[expected]]
+    assert layouts.encode_ext_sh(np.array([[rgb]], np.float32)).tolist() == [[expected]]
 
 
 @pytest.mark.parametrize("sh_degree", range(4))
@@ -120,7 +120,7 @@ def test_there_are_arrays_for_each_sh_degree(sh_degree: int) -> None:
     assert list(packed) == ["ext0", "ext1", *["sh1", "sh2", "sh3a", "sh3b"][: (0, 1, 2, 4)[sh_degree]]]
     words = np.concatenate([np.zeros((7, 0), np.uint32), *list(packed.values())[2:]], axis=1)
     coefficients = splats.sh.shape[1]
-    np.testing.assert_array_equal(words[:, :coefficients], ext_splats.encode_sh(splats.sh))
+    np.testing.assert_array_equal(words[:, :coefficients], layouts.encode_ext_sh(splats.sh))
     assert not words[:, coefficients:].any()
     for layout in (DEFAULT, EXT):
         assert round_trip(splats, layout).sh.shape == splats.sh.shape
@@ -250,7 +250,7 @@ def test_all_columns_of_any_splats_are_within_their_bounds(data: st.DataObject, 
 
 
 def code(field: str, encoding: SplatEncoding = DEFAULT, **columns: Any) -> Any:
-    return pack(splats_with(**columns), encoding)["packed"].view(packed_splats.SPLAT)[0, 0][field].tolist()
+    return pack(splats_with(**columns), encoding)["packed"].view(layouts.PACKED)[0, 0][field].tolist()
 
 
 #: Codes of scales, of which 0 is that of a scale of 0, or below e ** -30, alone.
@@ -297,7 +297,7 @@ def test_ties_of_sh_go_away_from_zero() -> None:
 def test_unpacked_words_are_packed_to_the_same_words() -> None:
     rng = np.random.default_rng(3)
     packed = rng.integers(0, 2**32, (1000, 4), np.uint32)
-    rows = packed.view(packed_splats.SPLAT)[:, 0]
+    rows = packed.view(layouts.PACKED)[:, 0]
     rows["center"] = rng.normal(size=(1000, 3))
     rows["axis"] = rng.integers(1, 255, (1000, 2))
     rows["angle"] = rng.integers(10, 256, 1000)
@@ -314,7 +314,7 @@ def test_unpacked_words_are_packed_to_the_same_words() -> None:
 def test_any_words_are_read_without_a_warning(words: np.ndarray, sh1: np.ndarray) -> None:
     splats = unpack({"packed": words[0], "sh1": sh1, "sh2": words[1], "sh3": words[2]}, LOD)
     assert all(np.isfinite(getattr(splats, column)).all() for column in COLUMNS[1:])
-    splats = unpack(dict(zip(("ext0", "ext1", *ext_splats.SH_ARRAYS), words, strict=True)), EXT)
+    splats = unpack(dict(zip(("ext0", "ext1", *layouts.SH_ARRAYS), words, strict=True)), EXT)
     assert np.isfinite(splats.quat_xyzw).all()
     assert np.isfinite(splats.sh).all()
 
@@ -327,9 +327,9 @@ def test_threads_and_blocks_do_not_change_a_word(layout: str) -> None:
     splats = random_splats(BLOCK_ROWS + 1024, sh_degree=3)
     count = np.zeros(len(splats), np.uint16)
     tree = LodTree(count, count.astype(np.uint32))
-    one, two = (array_files.pack_layout(Scene(splats, tree), layout, threads) for threads in (1, 2))
+    one, two = (layouts.pack_layout(Scene(splats, tree), layout, threads) for threads in (1, 2))
     rows = slice(BLOCK_ROWS, None)
-    last = {**one} if layout == "packed" else array_files.pack_layout(Scene(splats.take(rows), tree.rows(rows)), layout)
+    last = {**one} if layout == "packed" else layouts.pack_layout(Scene(splats.take(rows), tree.rows(rows)), layout)
     for name in one:
         np.testing.assert_array_equal(one[name], two[name])
         if layout != "packed":  # whose ranges follow all splats
@@ -361,25 +361,25 @@ def zeros(*shape: int, dtype: Any = np.uint32) -> np.ndarray:
 @pytest.mark.parametrize(
     ("unpack", "words", "text"),
     [
-        (packed_splats.unpack, PACKED | {"packed": zeros(3, 4, dtype=np.uint8)}, "packed is uint8"),
-        (packed_splats.unpack, PACKED | {"sh1": zeros(3, 4)}, r"sh1 is .*expected uint32\[3, 2\]"),
-        (packed_splats.unpack, PACKED | {"sh3": zeros(2, 4)}, r"sh3 is .*expected uint32\[3, 4\]"),
-        (packed_splats.unpack, without(PACKED, "sh1"), r"SH arrays of degree \(2, 3\)"),
-        (ext_splats.unpack, EXTENDED | {"ext0": zeros(3, 3)}, "ext0 is"),
-        (ext_splats.unpack, EXTENDED | {"ext1": zeros(4, 4)}, r"ext1 is .*expected uint32\[3, 4\]"),
-        *((ext_splats.unpack, without(EXTENDED, name), f"no array {name}, only ") for name in EXTENDED),
-        (spark_nodes.unpack, {}, "no array lod_tree"),
-        (spark_nodes.unpack, {"lod_tree": zeros(3, 3)}, "lod_tree is"),
+        (layouts.unpack_packed, PACKED | {"packed": zeros(3, 4, dtype=np.uint8)}, "packed is uint8"),
+        (layouts.unpack_packed, PACKED | {"sh1": zeros(3, 4)}, r"sh1 is .*expected uint32\[3, 2\]"),
+        (layouts.unpack_packed, PACKED | {"sh3": zeros(2, 4)}, r"sh3 is .*expected uint32\[3, 4\]"),
+        (layouts.unpack_packed, without(PACKED, "sh1"), r"SH arrays of degree \(2, 3\)"),
+        (layouts.unpack_ext, EXTENDED | {"ext0": zeros(3, 3)}, "ext0 is"),
+        (layouts.unpack_ext, EXTENDED | {"ext1": zeros(4, 4)}, r"ext1 is .*expected uint32\[3, 4\]"),
+        *((layouts.unpack_ext, without(EXTENDED, name), f"no array {name}, only ") for name in EXTENDED),
+        (layouts.unpack_nodes, {}, "no array lod_tree"),
+        (layouts.unpack_nodes, {"lod_tree": zeros(3, 3)}, "lod_tree is"),
         (
-            spark_nodes.unpack,
+            layouts.unpack_nodes,
             {"lod_tree": np.uint32([[0, 0, 1, 1], [0, 0, 65536, 2]])},
             "node 1 has 65,536 children",
         ),
-        (data_texture.capacity, {}, "no array texture, only none"),
-        (data_texture.capacity, {"texture": zeros(1, 2048, 4, dtype=np.uint8)}, "texture is uint8"),
-        (data_texture.capacity, {"texture": zeros(1, 1024, 4)}, r"expected uint32\[H, 2048, 4\]"),
-        (data_texture.capacity, {"texture": zeros(2048, 4)}, r"texture is uint32\[2048, 4\]"),
-        (data_texture.capacity, {"texture": np.array(3)}, r"texture is int64\[\]"),
+        (layouts.texture_capacity, {}, "no array texture, only none"),
+        (layouts.texture_capacity, {"texture": zeros(1, 2048, 4, dtype=np.uint8)}, "texture is uint8"),
+        (layouts.texture_capacity, {"texture": zeros(1, 1024, 4)}, r"expected uint32\[1, 2048, 4\]"),
+        (layouts.texture_capacity, {"texture": zeros(2048, 4)}, r"texture is uint32\[2048, 4\]"),
+        (layouts.texture_capacity, {"texture": np.array(3)}, r"texture is int64\[\]"),
     ],
 )
 def test_arrays_of_wrong_shapes_or_types_are_refused(unpack: Callable, words: Any, text: str) -> None:
@@ -407,8 +407,8 @@ AXES, OTHER_AXES = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 
 def texels_of(splats: Splats) -> np.ndarray:
-    """Rows of `data_texture.SPLAT`."""
-    return data_texture.pack(splats)["texture"].reshape(-1, 8).view(data_texture.SPLAT)[: len(splats), 0]
+    """Rows of `layouts.TEXELS`."""
+    return layouts.pack_texture(splats)["texture"].reshape(-1, 8).view(layouts.TEXELS)[: len(splats), 0]
 
 
 def covariance_of(splats: Splats) -> np.ndarray:
@@ -437,7 +437,7 @@ def viewers_texels(splats: Splats, index: int) -> bytes:
 
 def test_every_byte_is_that_of_the_slow_twin() -> None:
     splats = random_splats(3000)
-    texture = data_texture.pack(splats)["texture"]
+    texture = layouts.pack_texture(splats)["texture"]
     assert texture.shape == (3, 2048, 4)
     assert texture.dtype == np.uint32
     for index in range(len(splats)):
@@ -449,9 +449,9 @@ def test_every_byte_is_that_of_the_slow_twin() -> None:
 
 @pytest.mark.parametrize(("count", "height"), [(0, 1), (1, 1), (1024, 1), (1025, 2), (2048, 2)])
 def test_a_texture_has_as_many_rows_as_its_splats_need(count: int, height: int) -> None:
-    packed = data_texture.pack(random_splats(2048).take(slice(count)))
+    packed = layouts.pack_texture(random_splats(2048).take(slice(count)))
     assert packed["texture"].shape == (height, 2048, 4)
-    assert data_texture.capacity(packed) == 1024 * height
+    assert layouts.texture_capacity(packed) == 1024 * height
 
 
 @given(

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sparklod_cli.codecs import ext_splats, packed_splats, quantize, spark_codings, spark_nodes
+from sparklod_cli.codecs import layouts, quantize, spark_nodes
 from sparklod_cli.codecs.formats import LOADED
 from sparklod_cli.codecs.spark_codings import SplatEncoding, log_scale_table
 from sparklod_cli.codecs.spark_nodes import Nodes
@@ -46,8 +46,8 @@ def nodes(scene: Scene, layout: str, coding: FileCoding | None = None, threads: 
 
 def unpacked(scene: Scene, layout: str, encoding: SplatEncoding) -> Splats:
     if layout == "ext":
-        return ext_splats.unpack(ext_splats.pack(scene.splats))
-    return packed_splats.unpack(packed_splats.pack(scene.splats, encoding), encoding)
+        return layouts.unpack_ext(layouts.pack_ext(scene.splats))
+    return layouts.unpack_packed(layouts.pack_packed(scene.splats, encoding), encoding)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_nodes_are_nearly_those_of_unpacked_words(scene: Scene, layout: str, enc
     assert scene.tree is not None
     coding = FileCoding(packed_range=(NARROW.ln_scale_min, NARROW.ln_scale_max))
     found = nodes(scene, layout, coding)
-    twin = spark_nodes.unpack(spark_nodes.pack(unpacked(scene, layout, encoding), scene.tree))
+    twin = layouts.unpack_nodes(layouts.pack_nodes(unpacked(scene, layout, encoding), scene.tree))
     assert np.array_equal(found.center, twin.center)
     assert np.mean(found.size != twin.size) < 1e-3
     assert found.tree is scene.tree
@@ -81,10 +81,10 @@ def test_codes_are_decoded_as_spark_decodes_them(scene: Scene, layout: str, codi
     codes = np.random.default_rng(0).integers(1, 256, (len(scene), 3)).astype(np.uint8)
     logs = codes.astype(np.float32) / 16 - 10
     if coding[0] == "ln_0r8":
-        ours, theirs = log_scale_table(-12, 9)[codes], log_scale_table(-12, 9, exp=spark_codings.exp)[codes]
+        ours, theirs = log_scale_table(-12, 9)[codes], log_scale_table(-12, 9, exp=spark_nodes.exp)[codes]
     else:
         ours = quantize.decode_log_scale(codes) if coding == SPZ_SCALES else np.exp(logs)
-        theirs = spark_codings.exp(logs)
+        theirs = spark_nodes.exp(logs)
     assert not np.array_equal(ours, theirs)
     known = nodes(with_scales(scene, ours), layout, FileCoding((coding,)))
     assert np.array_equal(known.size, nodes(with_scales(scene, theirs), layout).size)
@@ -122,7 +122,7 @@ def links(child_count: Any, child_start: Any) -> LodTree:
 
 def test_a_node_is_four_words_of_these_bytes() -> None:
     splats = splats_with(2, center=[1, -2, 0.5], scale=[0.25, 0.5, 0.75], opacity=[1, linear_opacity(np.float32(3))])
-    packed = spark_nodes.pack(splats, links([65535, 0], [2**32 - 1, 0]))
+    packed = layouts.pack_nodes(splats, links([65535, 0], [2**32 - 1, 0]))
     expected = struct.pack("<4eII", 1, -2, 0.5, 1, 65535, 2**32 - 1) + struct.pack("<4eII", 1, -2, 0.5, 2.4, 0, 0)
     assert packed["lod_tree"].tobytes() == expected
     assert (list(packed), packed["lod_tree"].dtype, packed["lod_tree"].shape) == (["lod_tree"], np.uint32, (2, 4))
@@ -131,14 +131,14 @@ def test_a_node_is_four_words_of_these_bytes() -> None:
 def test_node_sizes_are_those_worked_out_by_hand() -> None:
     splats = splats_with(3, scale=[0.25, 0.5, 0.75], opacity=[0.3, 1, linear_opacity(np.float32(3))])
     np.testing.assert_allclose(gaussian.spark_size(splats), [1, 1, 2.4], rtol=1e-6)
-    sizes = spark_nodes.unpack(spark_nodes.pack(splats, links([0, 0, 0], [0, 0, 0]))).size
+    sizes = layouts.unpack_nodes(layouts.pack_nodes(splats, links([0, 0, 0], [0, 0, 0]))).size
     np.testing.assert_array_equal(sizes, np.float16([1, 1, 2.4]))
 
 
 def test_sizes_keep_and_reach_their_error() -> None:
     size = np.exp(np.linspace(-20, np.log(65504), 100_001)).astype(np.float32)
     spheres = splats_with(len(size), scale=(size / 2)[:, None], opacity=1)
-    got = spark_nodes.unpack(spark_nodes.pack(spheres, links([0] * size.size, [0] * size.size)))
+    got = layouts.unpack_nodes(layouts.pack_nodes(spheres, links([0] * size.size, [0] * size.size)))
     ratio = np.abs(got.size.astype(np.float64) - size) / half_float(size)
     assert 0.99 <= ratio.max() <= 1.001
     assert ratio[size < 2.0**-14].max() >= 0.99
@@ -146,14 +146,14 @@ def test_sizes_keep_and_reach_their_error() -> None:
 
 @given(center=arrays(np.float32, (8, 3), elements=st.floats(-65504, 65504, width=32)))
 def test_centres_of_nodes_keep_their_error(center: np.ndarray) -> None:
-    back = spark_nodes.unpack(spark_nodes.pack(splats_with(8, center=center), links([0] * 8, [0] * 8))).center
+    back = layouts.unpack_nodes(layouts.pack_nodes(splats_with(8, center=center), links([0] * 8, [0] * 8))).center
     assert (np.abs(back.astype(float) - center) <= half_float(center)).all()
 
 
 @pytest.mark.filterwarnings("error")
 def test_sizes_and_centres_beyond_float16_are_infinite_without_a_warning() -> None:
     splats = splats_with(1, center=[3e38, -3e38, 65519], scale=3e38, opacity=1000)
-    got = spark_nodes.unpack(spark_nodes.pack(splats, links([0], [0])))
+    got = layouts.unpack_nodes(layouts.pack_nodes(splats, links([0], [0])))
     assert got.center.tolist() == [[np.inf, -np.inf, 65504]]
     assert got.size.tolist() == [np.inf]
 
@@ -161,8 +161,8 @@ def test_sizes_and_centres_beyond_float16_are_infinite_without_a_warning() -> No
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_whole_tree_comes_back(threads: int) -> None:
     splats, tree = quick.build(random_splats(BLOCK_ROWS + 1000))
-    packed = spark_nodes.pack(splats, tree, threads=threads)
-    got = spark_nodes.unpack(packed)
+    packed = layouts.pack_nodes(splats, tree, threads=threads)
+    got = layouts.unpack_nodes(packed)
     np.testing.assert_array_equal(got.tree.child_count, tree.child_count)
     np.testing.assert_array_equal(got.tree.child_start, tree.child_start)
     np.testing.assert_array_equal(got.center, splats.center.astype(np.float16))
@@ -172,8 +172,8 @@ def test_a_whole_tree_comes_back(threads: int) -> None:
 
 
 def test_trees_of_no_nodes_are_empty_arrays_and_others_need_as_many_nodes_as_splats() -> None:
-    packed = spark_nodes.pack(Splats.empty(0, 0), links([], []))
+    packed = layouts.pack_nodes(Splats.empty(0, 0), links([], []))
     assert packed["lod_tree"].shape == (0, 4)
-    assert len(spark_nodes.unpack(packed).tree) == 0
+    assert len(layouts.unpack_nodes(packed).tree) == 0
     with pytest.raises(FormatError, match="2 nodes, but 3 splats"):
-        spark_nodes.pack(random_splats(3), links([0, 0], [0, 0]))
+        layouts.pack_nodes(random_splats(3), links([0, 0], [0, 0]))

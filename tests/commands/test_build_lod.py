@@ -172,7 +172,7 @@ def test_a_bake_of_a_ply_loads_no_other_reader(tmp_path: Path) -> None:
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "sparklod_cli.codecs.ply" in loaded and "PIL" not in loaded
     others = ("cameras.colmap", "codecs.sog", "codecs.streamed_manifest", "codecs.rad.rad_writer")
-    others += ("codecs.array_files", "bake.cluster", "bake.in_blocks", "bake.skipping")
+    others += ("codecs.layouts", "bake.cluster", "bake.in_blocks", "bake.skipping")
     assert not {f"sparklod_cli.{name}" for name in (*others, "viewers.instances_file")}.intersection(loaded)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.bake.simplifying import leaves_of
-from sparklod_cli.codecs import array_files, spz
+from sparklod_cli.codecs import layouts, spz
 from sparklod_cli.codecs.formats import ENCODINGS, FORMATS, WRITABLE
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.splat import importance_order
@@ -96,7 +96,7 @@ def test_a_tree_in_the_same_format_keeps_its_bytes(suffix: str, cli: Cli) -> Non
 @pytest.mark.parametrize("layout", ENCODINGS)
 def test_arrays_are_those_that_the_codec_packs(layout: str, cli: Cli) -> None:
     record = cli(f"convert {TREE} a.npz --layout {layout} --json").json
-    expected = array_files.pack_layout(read_scene(NAMED[TREE]), layout)
+    expected = layouts.pack_layout(read_scene(NAMED[TREE]), layout)
     assert (record["output_format"], record["bytes"]) == (layout, Path("a.npz").stat().st_size)
     with np.load("a.npz") as file:
         assert set(file) == set(expected) == set(record["arrays"])

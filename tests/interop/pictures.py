@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.codecs import ext_splats, spark_nodes
+from sparklod_cli.codecs import layouts
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
@@ -152,7 +152,7 @@ def cameras_around(center: NDArray[np.floating], width: int, height: int) -> lis
 def cut_of(held: Scene, camera: Camera, budget: int) -> NDArray[np.uint32]:
     """Return the nodes of sparklod's cut without foveation, ascending."""
     assert held.tree is not None
-    nodes = spark_nodes.unpack(spark_nodes.pack(held.splats, held.tree))
+    nodes = layouts.unpack_nodes(layouts.pack_nodes(held.splats, held.tree))
     view = CutView(camera.camera_to_world, camera.fov_x, camera.fov_y)
     smallest = pixel_limit(camera.fov_y, camera.height)
     return SparkViewer(Forest([nodes]), [TreeInstance()]).cut(view, budget=budget, smallest=smallest).indices()[0]
@@ -169,7 +169,7 @@ def compare(
     scene = read_scene(file)
     count = page.open(file, cameras[0], settings)
     assert count == len(scene.splats), f"Spark has {count:,} splats of {file.name}, not {len(scene.splats):,}"
-    held = Scene(ext_splats.unpack(ext_splats.pack(scene.splats)), scene.tree)
+    held = Scene(layouts.unpack_ext(layouts.pack_ext(scene.splats)), scene.tree)
     for camera in cameras:
         yield _difference(page, scene.splats, held, camera, settings, budget)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.codecs import ext_splats, packed_splats, spark_codings, spark_nodes
+from sparklod_cli.codecs import layouts, spark_codings
 from sparklod_cli.codecs.spark_codings import DEFAULT, SplatEncoding
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model import gaussian
@@ -73,7 +73,7 @@ def packed_steps(splats: Splats, encoding: SplatEncoding) -> dict[str, Steps]:
 
 
 def packed_codes(words: Words) -> dict[str, NDArray[Any]]:
-    rows = words["packed"].view(packed_splats.SPLAT)[:, 0]
+    rows = words["packed"].view(layouts.PACKED)[:, 0]
     codes = {name: rows[name] for name in ("rgb", "alpha", "center", "log_scale", "angle")}
     return codes | {"u": rows["axis"][:, 0], "v": rows["axis"][:, 1]}
 
@@ -87,10 +87,10 @@ def ext_steps(splats: Splats) -> dict[str, Steps]:
 
 
 def ext_codes(words: Words) -> dict[str, NDArray[Any]]:
-    second = words["ext1"].view(ext_splats.SPLAT_1)[:, 0]
+    second = words["ext1"].view(layouts.EXT_1)[:, 0]
     rotation = second["rotation"]
     return {
-        "alpha": words["ext0"].view(ext_splats.SPLAT_0)[:, 0]["alpha"],
+        "alpha": words["ext0"].view(layouts.EXT_0)[:, 0]["alpha"],
         "rgb": second["rgb"],
         "log_scale": second["log_scale"],
         "u": rotation & 1023,
@@ -136,26 +136,26 @@ def check_file(spark: Spark, path: Path, share: float, encoding: SplatEncoding =
 
 def check_packed(theirs: Words, scene: Scene, encoding: SplatEncoding, share: float) -> None:
     """Compare Spark's PackedSplats and tree of a scene with ours."""
-    ours = packed_splats.pack(scene.splats, encoding)
+    ours = layouts.pack_packed(scene.splats, encoding)
     check(packed_codes(ours), packed_codes(theirs), packed_steps(scene.splats, encoding), share)
     assert theirs.keys() - {"lodTree"} == ours.keys()
     for name in ours.keys() - {"packed"}:
         np.testing.assert_array_equal(ours[name], theirs[name])
     if scene.tree:
-        held = packed_splats.unpack({"packed": theirs["packed"]}, encoding)
-        check_tree(spark_nodes.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
+        held = layouts.unpack_packed({"packed": theirs["packed"]}, encoding)
+        check_tree(layouts.pack_nodes(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
 
 
 def check_ext(theirs: Words, scene: Scene, share: float) -> None:
     """Compare Spark's ExtSplats and tree of a scene with ours."""
-    ours = ext_splats.pack(scene.splats)
+    ours = layouts.pack_ext(scene.splats)
     np.testing.assert_array_equal(ours["ext0"][:, :3], theirs["ext0"][:, :3])
     check(ext_codes(ours), ext_codes(theirs), ext_steps(scene.splats), share)
     assert theirs.keys() - {"lodTree"} == ours.keys()
     np.testing.assert_array_equal(ext_sh(ours), ext_sh(theirs))
     if scene.tree:
-        held = ext_splats.unpack({name: theirs[name] for name in ("ext0", "ext1")})
-        check_tree(spark_nodes.pack(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
+        held = layouts.unpack_ext({name: theirs[name] for name in ("ext0", "ext1")})
+        check_tree(layouts.pack_nodes(held, scene.tree)["lod_tree"], theirs["lodTree"], held, share)
 
 
 def ext_sh(words: Words) -> NDArray[np.uint32]:
@@ -166,7 +166,7 @@ def ext_sh(words: Words) -> NDArray[np.uint32]:
 
 
 def check_tree(ours: NDArray[np.uint32], theirs: NDArray[np.uint32], held: Splats, share: float) -> None:
-    one, other = (words.view(spark_nodes.NODE)[:, 0] for words in (ours, theirs))
+    one, other = (words.view(layouts.NODE)[:, 0] for words in (ours, theirs))
     for name in ("center", "child_count", "child_start"):
         np.testing.assert_array_equal(one[name], other[name])
     steps, error = half(gaussian.spark_size(held))

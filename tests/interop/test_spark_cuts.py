@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import ext_splats, spark_nodes, spz
+from sparklod_cli.codecs import layouts, spz
 from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.spark_codings import SplatEncoding
@@ -79,14 +79,14 @@ class Tree:
 
     @classmethod
     def of(cls, words: np.ndarray) -> Tree:
-        return cls(words, spark_nodes.unpack({"lod_tree": words}))
+        return cls(words, layouts.unpack_nodes({"lod_tree": words}))
 
 
 @cache
 def baked(name: str, method: str = "quick") -> Tree:
     """Bake a scene; sizes of nodes are those of the splats in Spark's coding, as in Spark."""
     splats, tree = (quick if method == "quick" else quality).build(read_scene(scene(name)).splats)
-    return Tree.of(spark_nodes.pack(ext_splats.unpack(ext_splats.pack(splats)), tree)["lod_tree"])
+    return Tree.of(layouts.pack_nodes(layouts.unpack_ext(layouts.pack_ext(splats)), tree)["lod_tree"])
 
 
 def scene(name: str) -> Path:
@@ -452,7 +452,7 @@ def test_a_simulated_flight_is_that_of_spark(spark: Spark, capacity: int | None)
     whole = robot()
     assert whole.tree is not None
     scenes = read_scenes([Instance(whole, "playbot")], precision="float16")
-    paged = Paged(spark, [Tree.of(spark_nodes.pack(whole.splats, whole.tree)["lod_tree"])], pages=12)
+    paged = Paged(spark, [Tree.of(layouts.pack_nodes(whole.splats, whole.tree)["lod_tree"])], pages=12)
     settings = LodSettings(60_000, SPARKS_CONES)
     rng = np.random.default_rng(3)
     counts = set()

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 import sparklod_cli
 from fixtures import by_hand_rad
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import ext_splats, packed_splats, spark_nodes, spz
+from sparklod_cli.codecs import layouts, spz
 from sparklod_cli.codecs.options import DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
@@ -124,10 +124,10 @@ def test_trees_of_sparks_own_builder_round_trip(spark: Spark, tmp_path: Path, la
     path = put(tmp_path / "random.ply", as_ply(Scene(random_splats(20_000))))
     words = spark.load_words(layout, path, lod=True)
     packed = layout == "Packed"
-    held = packed_splats.unpack(words, SplatEncoding(lod_opacity=True)) if packed else ext_splats.unpack(words)
-    nodes = spark_nodes.unpack({"lod_tree": words["lodTree"]})
+    held = layouts.unpack_packed(words, SplatEncoding(lod_opacity=True)) if packed else layouts.unpack_ext(words)
+    nodes = layouts.unpack_nodes({"lod_tree": words["lodTree"]})
     nodes.tree.validate()
-    check_tree(spark_nodes.pack(held, nodes.tree)["lod_tree"], words["lodTree"], held, share=1e-3)
+    check_tree(layouts.pack_nodes(held, nodes.tree)["lod_tree"], words["lodTree"], held, share=1e-3)
     # Spark's LoD design, by whose size its quick builder sorts, defines another size.
     design = 2 * held.scale.max(axis=1) * np.maximum(lod_opacity(held.opacity), 1)
     assert (nodes.size != design.astype(np.float16)).mean() > 0.9
@@ -138,8 +138,8 @@ def test_sparks_worker_packs_only_a_scale_of_0_as_zero(spark: Spark, tmp_path: P
     splats = random_splats(1)
     splats.scale[:] = [0, np.exp(-31), np.exp(-29)]
     path = put(tmp_path / "tiny.ply", as_ply(Scene(splats)))
-    theirs = spark.load_words("Packed", path)["packed"].view(packed_splats.SPLAT)
-    ours = packed_splats.pack(read_scene(path).splats)["packed"].view(packed_splats.SPLAT)
+    theirs = spark.load_words("Packed", path)["packed"].view(layouts.PACKED)
+    ours = layouts.pack_packed(read_scene(path).splats)["packed"].view(layouts.PACKED)
     assert (theirs["log_scale"].tolist(), ours["log_scale"].tolist()) == ([[[0, 1, 1]]], [[[0, 0, 1]]])
 
 
@@ -396,8 +396,8 @@ BUILDERS: dict[str, Any] = {"quick": True, "quality": "quality"}
 def spark_tree(spark: Spark, source: Path, builder: str) -> Scene:
     """Return the tree that Spark builds from a file, as it has it in memory."""
     words = spark.load_words("Ext", source, lod=BUILDERS[builder])
-    nodes = spark_nodes.unpack({"lod_tree": words.pop("lodTree")})
-    return Scene(ext_splats.unpack(words), nodes.tree)
+    nodes = layouts.unpack_nodes({"lod_tree": words.pop("lodTree")})
+    return Scene(layouts.unpack_ext(words), nodes.tree)
 
 
 def inspected(path: Path, capsys: Capture, *options: str) -> tuple[int, dict[str, Any]]:
@@ -479,25 +479,25 @@ def test_words_are_those_of_sparks_encoders_in_javascript(
     def words(name: str, width: int, dtype: str = "<u4") -> NDArray[Any]:
         return np.fromfile(tmp_path / f"out.{name}", dtype).reshape(-1, width)
 
-    ours = packed_splats.pack(splats, encoding)
+    ours = layouts.pack_packed(splats, encoding)
     codes, steps = packed_codes(ours), packed_steps(splats, encoding)
     codes["center"] = to_half(splats.center)
     check(codes, packed_codes({"packed": words("packed", 4)}), steps, share=2e-4)
     for name in ("sh1", "sh2", "sh3"):
-        np.testing.assert_array_equal(ours[name], words(name, packed_splats.SH_WORDS[int(name[2])]))
+        np.testing.assert_array_equal(ours[name], words(name, layouts.SH_WORDS[int(name[2])]))
 
     ext = {name: words(name, 4) for name in ("ext0", "ext1")}
-    codes, steps = ext_codes(ext_splats.pack(splats)), ext_steps(splats)
+    codes, steps = ext_codes(layouts.pack_ext(splats)), ext_steps(splats)
     codes |= {"alpha": to_half(splats.opacity), "rgb": to_half(splats.rgb), "log_scale": to_half(np.log(splats.scale))}
     if to_half is cut_off:  # then ties of float32 logarithms are at whole steps
         value, error = steps["log_scale"]
         steps["log_scale"] = value + 0.5, error
     check(codes, ext_codes(ext), steps, share=2e-4)
-    assert (ext_splats.encode_sh(splats.sh) != words("ext-sh", 15)).mean() < 1e-4
+    assert (layouts.encode_ext_sh(splats.sh) != words("ext-sh", 15)).mean() < 1e-4
 
     for layout, held in (
-        ("packed", packed_splats.unpack({"packed": words("packed", 4)}, encoding)),
-        ("ext", ext_splats.unpack(ext)),
+        ("packed", layouts.unpack_packed({"packed": words("packed", 4)}, encoding)),
+        ("ext", layouts.unpack_ext(ext)),
     ):
         d = lod_opacity(held.opacity)
         alpha = np.where(d > 1, (d + 3) / 4, d)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from sparklod_cli.cameras.camera import Camera, Settings
 from sparklod_cli.cameras.framing import balls_of, framing
 from sparklod_cli.cameras.sources import orbit
-from sparklod_cli.codecs import spark_nodes
+from sparklod_cli.codecs import layouts
 from sparklod_cli.codecs.reader import check_valid, is_valid_and_visible
 from sparklod_cli.images.metrics import on_background, psnr
 from sparklod_cli.io.reading import read_scene
@@ -375,7 +375,7 @@ def picture(splats: Splats, camera: Camera) -> Image:
 
 def cut_of(tree: tuple[Splats, LodTree], camera: Camera, budget: int) -> Splats:
     """The nodes that Spark draws."""
-    forest = Forest([spark_nodes.unpack(spark_nodes.pack(*tree, threads=2))])
+    forest = Forest([layouts.unpack_nodes(layouts.pack_nodes(*tree, threads=2))])
     return tree[0].take(SparkViewer(forest, [TreeInstance()]).cut(camera, budget=budget).indices()[0])
 
 
