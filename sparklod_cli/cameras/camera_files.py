@@ -1,4 +1,4 @@
-"""Files of cameras: their formats are recognised and parsed; and matrices of `--world-transform`.
+"""Files of cameras: their formats are recognized and parsed, among them sparklod's own; and matrices.
 
 A parser reads `Files`, as text or as `CameraJson`, which checks values where they are used. It returns `Parsed` frames:
 poses in the axes of their format, and lenses as the file has them.
@@ -6,6 +6,9 @@ poses in the axes of their format, and lenses as the file has them.
 
 from __future__ import annotations
 
+import csv
+import dataclasses
+import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -22,9 +25,9 @@ from ..system import untrusted
 from ..system.errors import CameraPathError, SparklodError
 from ..system.untrusted import LARGEST as LARGEST_NUMBER
 from ..system.untrusted import Origin, decoded_text, parse_json, quoted_value
-from .camera import Frame, Matrix, Numbers, Settings, pose, rigid, rotation_of
-from .camera_formats import FORMATS, NAMES, PathFormat
-from .sources import CameraPath, cameras_of
+from .camera import NO_LENS, Frame, Intrinsics, Matrix, Numbers, Settings, frame_looking, pose, rigid, rotation_of
+from .camera_formats import FORMATS, NAMES, Axes, PathFormat
+from .sources import CameraPath, Key, between, cameras_of
 
 #: Most pixels along a side of an image.
 MAX_SIDE = 1 << 16
@@ -97,8 +100,19 @@ class CameraJson(untrusted.Json):
     def __init__(self, value: Any, above: untrusted.Json | Origin = ORIGIN, key: str | int = "") -> None:
         super().__init__(value, above, key)
 
+    @classmethod
+    def of_row(cls, names: Sequence[str], values: Sequence[Any], place: str) -> CameraJson:
+        """Return a row of a table as an object with a key for each column."""
+        if len(values) != len(names):
+            raise CameraPathError(f"{place} has {len(values)} values, not {len(names)}: {', '.join(names)}")
+        return cls(dict(zip(names, values, strict=True)), Origin(place, CameraPathError))
+
     def _number(self, value: Any) -> float | None:
-        return _finite(value)
+        try:
+            number = float(value)
+        except (TypeError, ValueError, OverflowError):
+            return None
+        return None if isinstance(value, bool) or not abs(number) < LARGEST_NUMBER else number
 
     def first_has(self, *keys: str) -> bool:
         return isinstance(self.value, list) and bool(self.value) and self.get(0).has(*keys)
@@ -113,15 +127,33 @@ class CameraJson(untrusted.Json):
         return number
 
     def side(self) -> int:
+        """Return the number of pixels along a side of an image."""
         number = self.number()
-        if not _is_side(number):
+        if not (1 <= number <= MAX_SIDE and number.is_integer()):
             raise self.unexpected("a number of pixels")
+        return int(number)
+
+    def identifier(self) -> int:
+        number = self.number()
+        if not number.is_integer():
+            raise self.unexpected("a whole number")
         return int(number)
 
     def label(self, key: str) -> str:
         """Return the text of a key that only names its object: of a number its digits, empty without the key."""
         value = self.value.get(key) if isinstance(self.value, dict) else None
         return value if isinstance(value, str) else "" if value is None else quoted_value(value)
+
+    def matrix_4x4(self, *rows: int) -> Matrix:
+        """Return the (4, 4) matrix of four rows, or of three rows above 0 0 0 1 if `rows` allow it."""
+        return np.array([*self.matrix(*(rows or (4,))), 0, 0, 0, 1][:16]).reshape(4, 4)
+
+    def pose(self, quat_wxyz: Sequence[float], position: Sequence[float]) -> Matrix:
+        """Return the (4, 4) pose of a quaternion of this object and a position; it is an error if one has length 0."""
+        try:
+            return pose(rotation_of(quat_wxyz), position)
+        except ValueError as error:
+            raise self.error(f"it {error}") from None
 
 
 def decoded(data: bytes) -> str | None:
@@ -131,48 +163,6 @@ def decoded(data: bytes) -> str | None:
     except UnicodeDecodeError:
         return None
     return None if "\0" in text else text
-
-
-def posed(quat_wxyz: Sequence[float], position: Sequence[float], way: str) -> Matrix:
-    """Return the (4, 4) pose of a quaternion and a position; `CameraPathError`, naming the place, for length 0."""
-    try:
-        return pose(rotation_of(quat_wxyz), position)
-    except ValueError as error:
-        raise CameraPathError(f"{way} {error}") from None
-
-
-def finite(value: Any, way: str) -> float:
-    """Return a finite number from a number or its digits; `CameraPathError`, naming its place, for anything else."""
-    number = _finite(value)
-    if number is None:
-        raise CameraPathError(f"{way} has {repr(value)[:30]}, which is not a finite number")
-    return number
-
-
-def _finite(value: Any) -> float | None:
-    try:
-        number = float(value) if not isinstance(value, bool) else math.nan
-    except (TypeError, ValueError, OverflowError):
-        return None
-    return number if abs(number) < LARGEST_NUMBER else None
-
-
-def whole(number: float, way: str) -> int:
-    """Return a whole number; `CameraPathError`, naming its place, for a fraction."""
-    if not number.is_integer():
-        raise CameraPathError(f"{way} has {number:g}, which is not a whole number")
-    return int(number)
-
-
-def side(number: float, way: str) -> int:
-    """Return pixels along a side of an image; `CameraPathError`, naming its place, for an impossible number."""
-    if not _is_side(number):
-        raise CameraPathError(f"{way} of {number:g} is not a number of pixels")
-    return int(number)
-
-
-def _is_side(number: float) -> bool:
-    return 1 <= number <= MAX_SIDE and number == int(number)
 
 
 #: Bytes of a camera path's file. COLMAP's images.txt has all points that its images see.
@@ -234,17 +224,13 @@ def similarity(text: str) -> Matrix:
     The numbers are separated by commas or white space, or JSON: a list of them or of rows. The text of a
     `CameraPathError` continues a sentence about them.
     """
-    words = re.split(r"[\s,;]+", text.strip())
     try:
-        if text.lstrip().startswith("["):
-            numbers = CameraJson(parse_json(text), Origin("matrix", CameraPathError)).matrix(4)
-        else:
-            numbers = [finite(word, "matrix") for word in words]
+        value = parse_json(text) if text.lstrip().startswith("[") else re.split(r"[\s,;]+", text.strip())
     except ValueError:
         raise CameraPathError("is not JSON") from None
-    if len(numbers) != 16:
-        raise CameraPathError(f"has {len(numbers)} numbers, not 16")
-    matrix = np.array(numbers).reshape(4, 4)
+    if len(value) not in (4, 16):
+        raise CameraPathError(f"has {len(value)} numbers, not 16")
+    matrix = CameraJson(value, Origin("matrix", CameraPathError)).matrix_4x4()
     try:
         rigid(matrix)
     except ValueError as error:
@@ -260,3 +246,141 @@ def read_world_transform(path: Path) -> Matrix:
         raise CameraPathError(f"{path}: --world-transform {error}") from None
     except SparklodError as error:
         raise CameraPathError(str(error)) from None
+
+
+#: sparklod's own files: JSON of cameras or keyframes, and CSV of a camera per row; docs/cameras.md describes both.
+FORMAT, VERSION = "sparklod-camera-path", 1
+
+POSITION, QUAT, TARGET = ("x", "y", "z"), ("qx", "qy", "qz", "qw"), ("target_x", "target_y", "target_z")
+
+#: Keys of a frame in JSON by the columns of CSV that they have the numbers of.
+KEYS = {
+    POSITION: "eye",
+    TARGET: "target",
+    QUAT: "quat_xyzw",
+    ("up_x", "up_y", "up_z"): "up",
+    ("width", "height"): "size",
+    ("time",): "time",
+    ("fov",): "fov",
+}
+COLUMNS = {"name", *itertools.chain.from_iterable(KEYS)}
+
+
+def recognises_sparklod(files: Files) -> bool:
+    """Return whether its field format says so."""
+    return files.json is not None and files.json.has("format") and files.json.value["format"] == FORMAT
+
+
+def parse_sparklod(files: Files, settings: Settings) -> Parsed:
+    """Return its frames, or those between its keyframes."""
+    root = files.object()
+    if root.has("version") and root.value["version"] != VERSION:
+        raise CameraPathError(f"version {quoted_value(root.value['version'])} is unknown, only {VERSION} is read")
+    lens = _lens(root, NO_LENS)
+    fps = root.optional("fps", CameraJson.positive)
+    if root.has("keyframes", "frames"):
+        raise CameraPathError("it has frames and keyframes; give one of them")
+    if root.has("keyframes"):
+        keys = [_key(item) for item in root.items("keyframes")]
+        frames, count = between(keys, settings.fps or fps, settings.up_axis, lens)
+        return Parsed(frames, fps=fps, turned=all(key.up for key in keys), count=count)
+    name = root.optional("axes", CameraJson.text, Axes.OPENGL_C2W.value)
+    try:
+        axes = Axes(name)
+    except ValueError:
+        known = ", ".join(axes.value for axes in Axes)
+        raise CameraPathError(f"axes {name[:20]!r} are unknown; use one of {known}") from None
+    items = list(root.items("frames"))
+    turned = all(item.has("up") or not item.has("eye") for item in items)
+    return Parsed([_frame(item, lens, axes, settings) for item in items], fps=fps, turned=turned)
+
+
+def _frame(item: CameraJson, default: Intrinsics, axes: Axes, settings: Settings) -> Frame:
+    lens = _lens(item, default)
+    time, name = item.optional("time", CameraJson.number), item.label("name")
+    if item.has("eye"):
+        up = item.get("up").numbers(3) if item.has("up") else settings.up_axis
+        return frame_looking(item.get("eye").numbers(3), item.get("target").numbers(3), up, lens, time, name)
+    if item.has("matrix"):
+        matrix = item.get("matrix").matrix_4x4()
+    else:
+        x, y, z, w = item.get("quat_xyzw").numbers(4)
+        matrix = item.pose([w, x, y, z], item.get("position").numbers(3))
+    return Frame(matrix, lens, time, name, None if settings.axes else axes)
+
+
+def _key(item: CameraJson) -> Key:
+    return Key(
+        tuple(item.get("eye").numbers(3)),
+        tuple(item.get("target").numbers(3)),
+        item.optional("up", lambda up: tuple(up.numbers(3))),
+        item.optional("fov", lambda fov: math.radians(fov.number())),
+        item.optional("time", CameraJson.number),
+    )
+
+
+def _lens(item: CameraJson, default: Intrinsics) -> Intrinsics:
+    """Return the lens of an object, whose fields override those of the whole file."""
+    if item.has("size"):
+        item.get("size").pair()
+        width, height = (each.side() for each in item.items("size"))
+        default = dataclasses.replace(default, size=(width, height))
+    if item.has("fov"):
+        default = dataclasses.replace(default, fov=math.radians(item.number("fov")), focal=None)
+    if item.has("focal"):
+        default = dataclasses.replace(default, focal=item.get("focal").pair())
+    if item.has("principal"):
+        default = dataclasses.replace(default, principal=item.get("principal").pair())
+    if (default.focal or default.principal) and not default.size:
+        raise item.error("a focal length or a principal point in pixels needs a size")
+    return default
+
+
+def recognises_csv(files: Files) -> bool:
+    """Return whether its first line names the columns of a pose."""
+    names = {*_names(files)}
+    return names >= {*POSITION, *QUAT} or names >= {*POSITION, *TARGET}
+
+
+def _names(files: Files) -> list[str]:
+    return [name.strip().lower() for name in (files.text or "").split("\n", 1)[0].split(",")]
+
+
+def resembles_csv(files: Files) -> bool:
+    """Return whether it looks like a failed attempt: it is named .csv, or its first line names some of the columns."""
+    names = _names(files)
+    return files.path.suffix.lower() == ".csv" or len(COLUMNS.intersection(names)) > 1
+
+
+def parse_csv(files: Files, settings: Settings) -> Parsed:
+    """Parse a camera per row, with named columns."""
+    lines, names = files.lines(), _names(files)
+    if not recognises_csv(files):
+        missing = min(([name for name in POSITION + way if name not in names] for way in (TARGET, QUAT)), key=len)
+        raise CameraPathError(
+            f"its first line, which names the columns, lacks {', '.join(missing)}; a camera needs"
+            f" {', '.join(POSITION)}, and {', '.join(TARGET)} or {', '.join(QUAT)}"
+        )
+    if len(set(names)) < len(names):
+        raise CameraPathError("its first line names a column twice")
+    try:
+        rows = [(f"line {number}", row) for number, row in enumerate(csv.reader(lines[1:]), 2) if row]
+    except csv.Error as error:
+        raise CameraPathError(f"it is not CSV: {error}") from None
+    frames = [_frame(_item_of_row(names, row, line), NO_LENS, Axes.OPENGL_C2W, settings) for line, row in rows]
+    unknown = sorted(set(names) - COLUMNS)
+    notes = (f"Unknown columns were ignored: {', '.join(unknown)}.",) if unknown else ()
+    return Parsed(frames, notes, turned=TARGET[0] not in names)
+
+
+def _item_of_row(names: list[str], values: list[str], line: str) -> CameraJson:
+    """Return a row of CSV as a frame of JSON; empty cells count as missing."""
+    row = CameraJson.of_row(names, [value.strip() or None for value in values], line)
+    item: dict[str, Any] = {"name": row.label("name")}
+    for columns, key in KEYS.items():
+        if row.has(columns[0]) or columns == POSITION:
+            numbers = [row.number(column) for column in columns]
+            item[key] = numbers if len(columns) > 1 else numbers[0]
+    if "quat_xyzw" in item:
+        item["position"] = item.pop("eye")
+    return CameraJson(item, Origin(line, CameraPathError))

@@ -53,8 +53,8 @@ class PathFormat(NamedTuple):
 
 #: The formats, in the order in which they are tried.
 FORMATS = (
-    PathFormat("sparklod", "sparklod's JSON", "sparklod_paths", Axes.OPENGL_C2W, looking=True),
-    PathFormat("csv", "sparklod's CSV", "sparklod_paths", Axes.OPENGL_C2W, looking=True),
+    PathFormat("sparklod", "sparklod's JSON", "camera_files", Axes.OPENGL_C2W, looking=True),
+    PathFormat("csv", "sparklod's CSV", "camera_files", Axes.OPENGL_C2W, looking=True),
     PathFormat(
         "nerfstudio",
         "nerfstudio's camera path",

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from ..system.errors import CameraPathError
+from ..system.untrusted import Origin
 from .camera import NO_LENS, Frame, Intrinsics, Settings
-from .camera_files import Files, Parsed, decoded, finite, posed, side, whole
+from .camera_files import CameraJson, Files, Parsed, decoded
 from .camera_formats import FORMATS
 
 #: An image of images.bin: number, rotation w x y z, translation x y z, and number of its camera; its name follows.
@@ -23,11 +24,14 @@ COUNT = struct.Struct("<Q")
 #: Bytes of a point in an image: x, y, and the number of a 3D point.
 POINT = 24
 
-#: Words of an image in a line of images.txt: those of `IMAGE` and its name, which may contain blanks.
-IMAGE_WORDS = 10
+#: Words of an image in a line of images.txt: values of `IMAGE`, and its name, which may contain blanks.
+IMAGE_COLUMNS = ("IMAGE_ID", "QW", "QX", "QY", "QZ", "TX", "TY", "TZ", "CAMERA_ID", "NAME")
 
 #: Words of a point in a line of images.txt: x, y, and the number of a 3D point.
 POINT_WORDS = 3
+
+#: Values of a camera before its parameters.
+CAMERA_COLUMNS = ("CAMERA_ID", "MODEL", "WIDTH", "HEIGHT")
 
 COMMENT = "# Image list with two lines of data per image"
 
@@ -80,7 +84,7 @@ def recognises_colmap(files: Files) -> bool:
 
 def _begins_with_rotation(line: str) -> bool:
     try:
-        return _is_unit(_text_image(line, "")[2])
+        return _is_unit(_image_of_line(line, "")[2])
     except CameraPathError:
         return False
 
@@ -97,22 +101,21 @@ def parse_colmap(files: Files, settings: Settings) -> Parsed:
     """Return its images, sorted by name: COLMAP writes them in any order."""
     cameras = None
     if "cameras.bin" in files.contents:
-        cameras = dict(_binary_cameras(files.contents["cameras.bin"]))
+        cameras = _binary_cameras(files.contents["cameras.bin"])
     elif "cameras.txt" in files.contents:
         cameras = _text_cameras(files.contents["cameras.txt"])
     name = next((name for name in ("images.bin", "images.txt") if name in files.contents), None)
     data = files.contents[name] if name else files.data
     binary = name == "images.bin" or (name is None and files.text is None)
-    images = list(_binary_images(data)) if binary else _text_images(data)
+    images = _binary_images(data) if binary else _text_images(data)
     notes = [] if cameras is not None else ["Without a cameras.txt or cameras.bin beside it, its lenses are unknown."]
-    frames = []
-    used = set()
-    for image, camera, quat, position, name in images:
+    frames, used = [], set()
+    for row, camera, quat, position in images:
         if cameras is not None and camera not in cameras:
-            raise CameraPathError(f"image {image} has camera {camera}, which does not exist")
+            raise row.error(f"it has camera {camera}, which does not exist")
         model, lens = cameras[camera] if cameras is not None else (None, NO_LENS)
         used.add(model)
-        frames.append(Frame(posed(quat, position, f"image {image}"), lens, name=name))
+        frames.append(Frame(row.pose(quat, position), lens, name=row.text("NAME")))
     distorting = sorted(model for model in used if model and (MODELS[model][1] or "FISHEYE" in model))
     if distorting:
         notes.append(f"The lens distortion of {', '.join(distorting)} was ignored.")
@@ -125,8 +128,8 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(len(part) if index % 2 else 0, part) for index, part in enumerate(parts)]
 
 
-#: An image: number, number of its camera, rotation w x y z, translation x y z, and name.
-Image = tuple[int, int, list[float], list[float], str]
+#: An image: its values by the names of `IMAGE_COLUMNS`, number of its camera, rotation w x y z, and translation.
+Image = tuple[CameraJson, int, list[float], list[float]]
 
 
 def _text_images(data: bytes) -> list[Image]:
@@ -141,18 +144,21 @@ def _text_images(data: bytes) -> list[Image]:
         if points_may_follow and _is_points(line):
             points_may_follow = False
             continue
-        images.append(_text_image(line, f"line {number} of images.txt"))
+        images.append(_image_of_line(line, f"line {number} of images.txt"))
         points_may_follow = True
     _check_count(len(images), announced, "images.txt", "images")
     return images
 
 
-def _text_image(line: str, way: str) -> Image:
-    words = line.split(maxsplit=IMAGE_WORDS - 1)
-    if len(words) != IMAGE_WORDS:
-        raise CameraPathError(f"{way} has {len(words)} values, an image has {IMAGE_WORDS}")
-    image, *numbers, camera = (finite(word, way) for word in words[:9])
-    return whole(image, way), whole(camera, way), numbers[:4], numbers[4:], words[9].strip()
+def _image_of_line(line: str, place: str) -> Image:
+    return _image(line.strip().split(maxsplit=len(IMAGE_COLUMNS) - 1), place)
+
+
+def _image(values: Sequence[Any], place: str) -> Image:
+    row = CameraJson.of_row(IMAGE_COLUMNS, values, place)
+    _, *numbers, _ = map(row.number, IMAGE_COLUMNS[:-1])
+    row.get("IMAGE_ID").identifier()
+    return row, row.get("CAMERA_ID").identifier(), numbers[:4], numbers[4:]
 
 
 def _is_points(line: str) -> bool:
@@ -174,17 +180,23 @@ def _text_cameras(data: bytes) -> Cameras:
     lines, announced = _lines(data, "cameras.txt")
     cameras: Cameras = {}
     for number, line in lines:
-        words = line.split()
-        way = f"line {number} of cameras.txt"
-        if len(words) < 4:
-            raise CameraPathError(f"{way} has {len(words)} values, a camera has more")
-        model = words[1]
-        if model not in MODELS:
-            raise CameraPathError(f"{way} has a camera model {model[:30]!r}, which is unknown")
-        key, width, height, *numbers = (finite(word, way) for word in (words[0], *words[2:]))
-        cameras[whole(key, way)] = (model, lens_of(model, width, height, numbers, way))
+        key, values = _camera(line.split(), f"line {number} of cameras.txt")
+        cameras[key] = values
     _check_count(len(cameras), announced, "cameras.txt", "cameras")
     return cameras
+
+
+def _camera(values: Sequence[Any], place: str) -> tuple[int, tuple[str, Intrinsics]]:
+    """Return the number, model and lens, without its distortion, of a camera: `CAMERA_COLUMNS`, then its parameters."""
+    row = CameraJson(dict(zip(CAMERA_COLUMNS, values, strict=False)), Origin(place, CameraPathError))
+    row.value["PARAMS"] = list(values[len(CAMERA_COLUMNS) :])
+    model = row.text("MODEL")
+    focals, others = MODELS.get(model, (0, 0))
+    if not focals:
+        raise row.get("MODEL").unexpected("a pinhole camera of COLMAP")
+    numbers = row.get("PARAMS").numbers(focals + 2 + others)
+    size, focal = (row.get("WIDTH").side(), row.get("HEIGHT").side()), (numbers[0], numbers[focals - 1])
+    return row.get("CAMERA_ID").identifier(), (model, Intrinsics(size, focal, (numbers[focals], numbers[focals + 1])))
 
 
 def _lines(data: bytes, name: str) -> tuple[list[tuple[int, str]], int | None]:
@@ -206,45 +218,44 @@ def _check_count(count: int, announced: int | None, name: str, items: str) -> No
 
 
 def _binary_images(data: bytes) -> Iterator[Image]:
-    reader = _Reader(data, "images.bin")
-    (count,) = reader.take(COUNT)
-    reader.expect(count, IMAGE.size + 1 + COUNT.size)
-    for _ in range(count):
-        image, *numbers, camera = reader.take(IMAGE)
+    reader = _Reader(data, "images.bin", IMAGE.size + 1 + COUNT.size)
+    for _ in range(reader.count):
+        values = reader.take(IMAGE)
         name = reader.text()
         (points,) = reader.take(COUNT)
         reader.skip(points * POINT)
-        way = f"image {image}"
-        yield image, camera, [finite(x, way) for x in numbers[:4]], [finite(x, way) for x in numbers[4:]], name
-    reader.finish(count)
+        yield _image((*values, name), f"image {values[0]}")
+    reader.finish()
 
 
-def _binary_cameras(data: bytes) -> Iterator[tuple[int, tuple[str, Intrinsics]]]:
-    reader = _Reader(data, "cameras.bin")
-    (count,) = reader.take(COUNT)
-    reader.expect(count, CAMERA.size)
-    for _ in range(count):
-        key, number, width, height = reader.take(CAMERA)
-        way = f"camera {key}"
+def _binary_cameras(data: bytes) -> Cameras:
+    reader, cameras = _Reader(data, "cameras.bin", CAMERA.size), Cameras()
+    for _ in range(reader.count):
+        key, number, *size = reader.take(CAMERA)
         if not 0 <= number < len(MODELS):
-            raise CameraPathError(f"{way} is of model {number}, which is unknown")
-        model = list(MODELS)[number]
-        count_of_model = 2 + sum(MODELS[model])
-        numbers = [finite(value, way) for value in reader.take(struct.Struct(f"<{count_of_model}d"))]
-        yield key, (model, lens_of(model, width, height, numbers, way))
-    reader.finish(count)
+            raise CameraPathError(f"camera {key} is of model {number}, which is unknown")
+        model, counts = list(MODELS.items())[number]
+        numbers = reader.take(struct.Struct(f"<{2 + sum(counts)}d"))
+        cameras[key] = _camera((key, model, *size, *numbers), f"camera {key}")[1]
+    reader.finish()
+    return cameras
 
 
 class _Reader:
-    """Reads through the bytes of a file; `CameraPathError` if they end too early."""
+    """Reads through the bytes of a file; `CameraPathError` if they end too early.
 
-    def __init__(self, data: bytes, name: str) -> None:
+    Args:
+        least: bytes of the smallest item.
+
+    Attributes:
+        count: number of items that the file announces.
+    """
+
+    def __init__(self, data: bytes, name: str, least: int) -> None:
         self._data, self._name, self._at = data, name, 0
-
-    def expect(self, count: int, least: int) -> None:
-        """Check that `count` items of at least `least` bytes can follow."""
-        if count > (len(self._data) - self._at) // least:
-            raise CameraPathError(f"{self._name} announces {count:,} items, more than it can hold")
+        (self.count,) = self.take(COUNT)
+        if self.count > (len(data) - COUNT.size) // least:
+            raise CameraPathError(f"{name} announces {self.count:,} items, more than it can hold")
 
     def take(self, layout: struct.Struct) -> tuple[Any, ...]:
         self.skip(layout.size)
@@ -263,17 +274,6 @@ class _Reader:
         if self._at > len(self._data):
             raise CameraPathError(f"{self._name} ends before all of its data")
 
-    def finish(self, count: int) -> None:
+    def finish(self) -> None:
         if left := len(self._data) - self._at:
-            raise CameraPathError(f"{self._name} has {left:,} bytes after the {count:,} items that it announces")
-
-
-def lens_of(model: str, width: float, height: float, numbers: list[float], way: str) -> Intrinsics:
-    """Return the lens of a camera, without its distortion; `CameraPathError` if its model has none or other numbers."""
-    focals, others = MODELS[model]
-    if not focals:
-        raise CameraPathError(f"{way} is {model}, which is not a pinhole camera")
-    if len(numbers) != focals + 2 + others:
-        raise CameraPathError(f"{way} has {len(numbers)} parameters, not the {focals + 2 + others} of {model}")
-    principal = numbers[focals], numbers[focals + 1]
-    return Intrinsics((side(width, way), side(height, way)), (numbers[0], numbers[focals - 1]), principal)
+            raise CameraPathError(f"{self._name} has {left:,} bytes after the {self.count:,} items that it announces")

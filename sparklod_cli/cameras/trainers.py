@@ -12,8 +12,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..system.errors import CameraPathError
+from ..system.untrusted import Origin
 from .camera import NO_LENS, Frame, Intrinsics, Settings, pose
-from .camera_files import CameraJson, Files, Parsed, finite, posed
+from .camera_files import CameraJson, Files, Parsed
 
 #: The camera types of nerfstudio's paths that are read as pinhole cameras.
 PINHOLES = ("perspective", "fisheye")
@@ -44,8 +45,8 @@ def parse_nerfstudio(files: Files, settings: Settings) -> Parsed:
 
     def frame(item: CameraJson) -> Frame:
         degrees = item.optional("fov", CameraJson.number)  # vertical, as in three.js; the aspect is that of the size
-        matrix = np.array(item.get("camera_to_world").matrix(4)).reshape(4, 4)
-        return Frame(matrix, Intrinsics(size, fov=None if degrees is None else math.radians(degrees)))
+        fov = None if degrees is None else math.radians(degrees)
+        return Frame(item.get("camera_to_world").matrix_4x4(), Intrinsics(size, fov=fov))
 
     frames = list(map(frame, root.items("camera_path")))
     fps = root.optional("fps", CameraJson.number, 0.0)
@@ -73,7 +74,7 @@ def parse_transforms(files: Files, settings: Settings) -> Parsed:
         notes.append("Its applied_transform was not undone.")
     frames = []
     for item in items:
-        matrix = np.array([*item.get("transform_matrix").matrix(3, 4), 0, 0, 0, 1][:16]).reshape(4, 4)
+        matrix = item.get("transform_matrix").matrix_4x4(3, 4)
         frames.append(Frame(matrix, _lens(item, root), name=item.label("file_path")))
     return Parsed(frames, tuple(notes))
 
@@ -156,14 +157,9 @@ def parse_open3d(files: Files, settings: Settings) -> Parsed:
 
 def _frames_of_log(lines: list[str]) -> list[Frame]:
     rows: list[list[float]] = []
-    for number, line in enumerate(lines, 1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        words = line.split()
-        count = 4 if len(rows) % LOG_LINES else 3
-        if len(words) != count:
-            raise CameraPathError(f"line {number} has {len(words)} numbers, not {count}")
-        rows.append([finite(word, f"line {number}") for word in words])
+    for number, words in _rows(lines):
+        row = CameraJson(words, Origin(f"line {number}", CameraPathError))
+        rows.append(row.numbers(4 if len(rows) % LOG_LINES else 3))
     if len(rows) % LOG_LINES:
         raise CameraPathError("it ends inside a pose")
     poses = [np.array(rows[at + 1 : at + LOG_LINES]) for at in range(0, len(rows), LOG_LINES)]
@@ -187,13 +183,9 @@ def parse_tum(files: Files, settings: Settings) -> Parsed:
     """Parse a pose per line: `timestamp tx ty tz qx qy qz qw`."""
     frames = []
     for line, words in _rows(files.lines()):
-        way = f"line {line}"
-        if len(words) != len(COLUMNS):
-            raise CameraPathError(f"{way} has {len(words)} values, not {' '.join(COLUMNS)}")
-        time, *position, x, y, z, w = (
-            finite(each, f"{name} of {way}") for name, each in zip(COLUMNS, words, strict=True)
-        )
-        frames.append(Frame(posed([w, x, y, z], position, way), time=time))
+        row = CameraJson.of_row(COLUMNS, words, f"line {line}")
+        time, *position, x, y, z, w = map(row.number, COLUMNS)
+        frames.append(Frame(row.pose([w, x, y, z], position), time=time))
     return Parsed(frames)
 
 
