@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,6 @@ import click
 
 from ..codecs.formats import FORMATS, MANIFEST, TILESET, WRITABLE
 from ..codecs.formats import RAD_SUFFIX as RAD
-from ..codecs.options import MAX_SH_CODES, SH_CODES, WriteOptions
 from ..fitting import FIT_DEVICE_HELP, SEED, SEED_HELP, STEPS
 from ..lod.tree_settings import (
     DEFAULT_BASE,
@@ -27,50 +26,36 @@ from ..lod.tree_settings import (
     DetailSettings,
     TileSettings,
 )
-from ..model import MAX_SH_DEGREE
 from ..render import DEVICES
 from ..system import interrupts
 from ..system.addresses import Address, Place
 from ..system.errors import SparklodError
-from ..system.setting_fields import Quantity, Range, setting, whole
+from ..system.setting_fields import Range, setting, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import format_size, percent_of
 from ..system.untrusted import MOST, shortened
-from .command import COMMON, Command, OptionalNumber, flag, values_of
+from .command import COMMON, Command, flag, values_of
 from .console import Console, count_of, print_json, say
-from .option_groups import (
-    EACH_AS_JSON,
-    FILE_FORMAT,
-    JSON,
-    OUTPUT,
-    OVERWRITE,
-    SCENE_HEADINGS,
-    General,
-    SceneOptions,
-    bake_settings,
-    memory_size,
-)
-from .outputs import (
-    ARRAYS,
-    FORMS,
-    NAMELESS,
-    TREE_FORMS,
-    NamedPath,
-    Target,
-    claim_stdout,
-    is_same_place,
-    keep_apart,
-    shown,
-    stem_of,
-)
+from .option_groups import OUTPUT, OVERWRITE
+from .outputs import NAMELESS, Folder, NamedPath, is_same_place, stem_of
 from .rules import check, is_set
+from .writing_options import (
+    ARRAYS,
+    MEMORY,
+    SCENE_HEADINGS,
+    TREE_FORMS,
+    Form,
+    OptionalNumber,
+    Writing,
+    check_outputs,
+    form_of,
+)
 
 if TYPE_CHECKING:
     from ..api.bake_jobs import Outcome, Pair
     from ..api.converting import Converted
     from ..bake.settings import Baked, BakeSettings, Source
-    from ..codecs.losses import Clamp, Losses
-    from ..fitting.fit_settings import Refined
+    from ..codecs.losses import Losses
     from ..model.instances import Instance
 
 EXAMPLES = """\
@@ -192,9 +177,7 @@ class BuildLodOptions:
         METHODS,
         heading=COMMON,
     )
-    max_sh: int = setting(
-        "Highest degree of spherical harmonics to keep.", whole(0, MAX_SH_DEGREE), MAX_SH_DEGREE, heading=COMMON
-    )
+    writing: Writing = field(default_factory=Writing)
     base: float = setting(
         "Growth of the voxel grid from level to level, with --method quick. Smaller values give smoother transitions"
         " and more nodes.",
@@ -208,17 +191,6 @@ class BuildLodOptions:
         f" 3d-tiles]",
         Range(MIN_GROWTH, MAX_GROWTH, unit="N"),
         heading=TREE,
-    )
-    input_scene: SceneOptions = field(default_factory=SceneOptions)
-    written: WriteOptions = field(default_factory=WriteOptions)
-    cluster_sh: int | None = setting(
-        "Write spherical harmonics to RAD as a palette of at most N entries, 2 to 65,536, and a label for each splat:"
-        " the file gets smaller, and reflections less exact. N is 65,536 if it is left out. SOG always has a palette;"
-        " this chooses its size, which otherwise suits the number of splats.",
-        OptionalNumber(SH_CODES, example=MAX_SH_CODES),
-        is_flag=False,
-        flag_value=str(MAX_SH_CODES),
-        heading=FILE_FORMAT,
     )
     detail: DetailSettings = field(default_factory=DetailSettings)
     environment: Path | None = setting(
@@ -237,7 +209,7 @@ class BuildLodOptions:
     memory: int | None = setting(
         "Memory that a bake may take, such as 4G or '600 MB'. A scene that needs more is baked out of core: block by"
         " block, with a scratch folder.  [default: 75 % of what is available]",
-        Quantity("SIZE", memory_size),
+        MEMORY,
         heading=LARGE,
     )
     scratch_dir: Place | None = setting(
@@ -259,62 +231,6 @@ class BuildLodOptions:
         metavar="ADDRESS",
         heading=CLUSTER,
     )
-    as_json: bool = flag(EACH_AS_JSON, **JSON)
-    general: General = field(default_factory=General)
-
-    @property
-    def target(self) -> Target:
-        """Target that --output, --output-dir and --format describe; refined RAD files stay RAD."""
-        target = Target.of(self.output, self.form, self.output_dir)
-        if self.refine is None or self.form is not None or target.kind == "file":
-            return target
-        are_rad = {source.suffix.lower() for source in self.inputs} == {RAD}
-        return dataclasses.replace(target, form=FORMS["rad"]) if are_rad else target
-
-    def output_of(self, source: Place, target: Target) -> Place:
-        """Return the output for an input."""
-        if target.file is not None:
-            return target.file
-        form, stem = target.form, stem_of(source)
-        is_chosen = self.form is not None or self.refine is not None
-        if form.manifest or (is_chosen and source.suffix.lower() in TREES):
-            stem = stem.removesuffix("-lod")  # a tree in another format has its name
-        name = f"{stem}-lod/{form.manifest}" if form.manifest else f"{stem}-lod{form.suffix}"
-        if self.refine is not None and name == source.name:
-            name = f"{stem}-lod-refined{form.suffix}"
-        return (target.folder or source.parent) / name
-
-    def builder(self, target: Target) -> str:
-        """Return the builder of the tree, by --method, or else by the format."""
-        return self.method or (QUALITY if target.form.manifest else METHODS[0])
-
-    def settings(self, ctx: click.Context, target: Target) -> BakeSettings:
-        """Return the settings of bakes; loads numpy."""
-        refine = None
-        if self.refine is not None:
-            from ..fitting.fit_settings import FitSettings
-
-            refine = FitSettings(self.refine or None, self.seed, device=self.device)
-        form = target.form
-        names_tree = target.file is not None and target.file != DASH and form.suffix in TREES
-        return bake_settings(
-            ctx,
-            form,
-            self.input_scene,
-            self.written,
-            self.cluster_sh,
-            method=self.builder(target),
-            base=self.base,
-            growth=self.growth or (DETAIL_GROWTH if form.manifest else DEFAULT_GROWTH),
-            max_sh=self.max_sh,
-            detail=self.detail if form.name == DETAIL else None,
-            tiles=self.tiles if form.name == TILED else None,
-            environment=self.environment,
-            environment_beyond=self.environment_beyond,
-            refine=refine,
-            camera_path=self.camera_path,
-            converts=self.form is not None or names_tree or bool(form.manifest),
-        )
 
 
 #: Options of earlier versions, and what to write instead.
@@ -343,19 +259,19 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     several inputs are baked side by side (extra cluster).
     """
     options = values_of(ctx, BuildLodOptions)
-    general, target = options.general, options.target
-    instances = _check(ctx, options, target)
+    writing, general = options.writing, options.writing.general
+    form, pairs, instances = _check(ctx, options)
     failed, console = False, Console(quiet=general.quiet, verbose=general.verbose)
     with console, contextlib.ExitStack() as stack:
         from ..api.bake_jobs import bake_files, merged_source
 
-        pairs: Sequence[Pair] = [(source, options.output_of(source, target)) for source in options.inputs]
-        if target.file is not None and (options.merge or options.scene is not None):
-            pairs = [(merged_source(options.inputs, instances), target.file)]
+        if options.merge or options.scene is not None:
+            assert isinstance(options.output, (Path, Address))  # by the rules
+            pairs = [(merged_source(options.inputs, instances), options.output)]
             if any(each.lod_scale != 1 or each.foveation is not None for each in instances):
                 viewers = "lod_scale and foveation of instances are for viewers, and no part of a tree"
                 console.say(f"{options.scene}: {viewers}")
-        settings = options.settings(ctx, target)
+        settings = _settings(ctx, options, form)
         console.announce_compiling(settings)
         outcomes = bake_files(
             pairs,
@@ -375,73 +291,42 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
         )
         stack.enter_context(contextlib.closing(outcomes))
         for (source, output), outcome in zip(pairs, outcomes, strict=True):
-            if isinstance(outcome, SparklodError):
-                failed = True
-                console.error(f"{name_of(source)}: {outcome}")
-            elif outcome is None:
-                console.say(f"{name_of(source)}  ->  {output}  exists already")
-            else:
-                report_baked(console, source, shown(output), outcome)
-            if options.as_json:
-                print_json(record_of(source, output, outcome))
-            exit_if_interrupted(ctx, console)
+            failed |= isinstance(outcome, SparklodError)
+            report(ctx, console, source, output, outcome, as_json=writing.as_json)
     if failed:
         ctx.exit(1)
 
 
-def exit_if_interrupted(ctx: click.Context, console: Console) -> None:
-    """Exit after Ctrl-C during fitting, which then ends early and writes its output."""
-    if interrupts.came.is_set():
-        console.clear()
-        say("interrupted")
-        ctx.exit(interrupts.INTERRUPTED)
+def _check(ctx: click.Context, options: BuildLodOptions) -> tuple[Form, Sequence[Pair], list[Instance]]:
+    """Return the format, inputs with their outputs, and the instances of --scene.
 
-
-def _check(ctx: click.Context, options: BuildLodOptions, target: Target) -> list[Instance]:
-    """Return the instances of --scene; raise a `click.UsageError` where options or names of files contradict."""
-    inputs, merges = options.inputs, options.merge or options.scene is not None
+    Raises a `click.UsageError` where options or names of files contradict each other.
+    """
+    inputs, output = options.inputs, options.output
+    file, folder = (None, output.path) if isinstance(output, Folder) else (output, options.output_dir)
     if not inputs and options.scene is None:
         raise click.MissingParameter(ctx=ctx, param=next(each for each in ctx.command.params if each.name == "inputs"))
-    source = "standard input" if DASH in inputs else "files"
-    check(ctx, place=target.kind, source=source, count=len(inputs))
+    place = "standard output" if file == DASH else "folder" if file is None else "file"
+    check(ctx, place=place, source="standard input" if DASH in inputs else "files", count=len(inputs))
     instances: list[Instance] = []
     if options.scene is not None:
         from ..viewers.instances_file import read_instances
 
         instances = read_instances(options.scene)
-    if target.file is not None and len(inputs) > 1 and not options.merge:
-        raise click.UsageError(
-            f"--output takes one input, not {len(inputs)}; add --merge to bake them as one scene, or name a folder"
-        )
-    if target.file is None and DASH in inputs:
+    if file is None and DASH in inputs:
         raise click.UsageError(NAMELESS)
-    if target.file is None and target.folder is None:
-        for each in inputs:
-            if isinstance(each, Address) and each.is_read_only:
-                raise click.UsageError(f"nothing can be written beside {each}; name the output with -o or --output-dir")
-    outputs = [options.output_of(each, target) for each in inputs] if target.file is None else [target.file]
-    if options.refine is not None and options.overwrite and not options.skip_existing and not merges:
-        # A tree may replace itself, for its leaves and links stay.
-        outputs = [output for each, output in zip(inputs, outputs, strict=True) if not is_same_place(each, output)]
-    named = [instance.file for instance in instances if instance.file is not None]
-    keep_apart(ctx, {"output": target.files(outputs), "scene": named})
-    claim_stdout(ctx, "output", as_json=options.as_json, binary=True)
-    _check_format(options, target)
-    check(ctx, format=target.form.name, method=options.builder(target))
-    return instances
-
-
-def _check_format(options: BuildLodOptions, target: Target) -> None:
-    """Raise a `click.UsageError` where the format is not clear, or holds no tree."""
-    suffixes = {source.suffix.lower() for source in options.inputs}
-    keeps_format = options.refine is not None and options.form is None and options.output is None
-    if keeps_format and RAD in suffixes and len(suffixes) > 1:
-        raise click.UsageError(
-            "--refine keeps the format of a Level-of-Detail file, and the inputs are of several; give --format, or"
-            " refine the .rad files on their own"
-        )
-    target.check_name("--output", ENDINGS)
-    form, known = target.form, f"{', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
+    for each in inputs if file is None and folder is None else ():
+        if isinstance(each, Address) and each.is_read_only:
+            raise click.UsageError(f"nothing can be written beside {each}; name the output with -o or --output-dir")
+    form, suffixes = form_of(output, options.form), {source.suffix.lower() for source in inputs}
+    if options.refine is not None and options.form is None and file is None and RAD in suffixes:
+        if len(suffixes) > 1:
+            raise click.UsageError(
+                "--refine keeps the format of a Level-of-Detail file, and the inputs are of several; give --format, or"
+                " refine the .rad files on their own"
+            )
+        form = TREE_FORMS["rad"]
+    known = f"{', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
     if form.suffix in ARRAYS:
         raise click.UsageError(f"{form.suffix} holds arrays; bake a tree, and write it with sparklod convert --layout")
     if form.suffix in PLAIN and not form.manifest:
@@ -450,133 +335,174 @@ def _check_format(options: BuildLodOptions, target: Target) -> None:
         raise click.UsageError(
             f"trees are written as SPZ, RAD, {DETAIL} or {TILED}, not as {form.suffix}; name the output {known}"
         )
+    merges = options.merge or options.scene is not None
+    pairs = [(each, file or _output_of(options, form, each, folder)) for each in inputs[: 1 if merges else None]]
+    outputs = [target for _, target in pairs] if pairs or file is None else [file]
+    if options.refine is not None and options.overwrite and not options.skip_existing and not merges:
+        # A tree may replace itself, for its leaves and links stay.
+        outputs = [target for source, target in pairs if not is_same_place(source, target)]
+    method = options.method or (QUALITY if form.manifest else METHODS[0])
+    check_outputs(ctx, form, outputs, ENDINGS, instances, method=method)
+    return form, pairs, instances
 
 
-def record_of(source: Source, target: Place, outcome: Outcome | Converted) -> dict[str, Any]:
-    """Return the JSON of a result; several inputs that are one scene are "inputs"."""
-    if isinstance(source, (Path, Address)):
-        record: dict[str, Any] = {"input": str(source)}
-    else:
-        record = {"inputs": [str(file) for file, _ in source.files]}
+def _output_of(options: BuildLodOptions, form: Form, source: Place, folder: Place | None) -> Place:
+    """Return the output for an input, in a folder or else beside it."""
+    stem = stem_of(source)
+    if form.manifest or ((options.form is not None or options.refine is not None) and source.suffix.lower() in TREES):
+        stem = stem.removesuffix("-lod")  # a tree in another format has its name
+    name = f"{stem}-lod/{form.manifest}" if form.manifest else f"{stem}-lod{form.suffix}"
+    if options.refine is not None and name == source.name:
+        name = f"{stem}-lod-refined{form.suffix}"
+    return (folder or source.parent) / name
+
+
+def _settings(ctx: click.Context, options: BuildLodOptions, form: Form) -> BakeSettings:
+    """Return the settings of bakes; loads numpy."""
+    refine = None
+    if options.refine is not None:
+        from ..fitting.fit_settings import FitSettings
+
+        refine = FitSettings(options.refine or None, options.seed, device=options.device)
+    names_tree = isinstance(options.output, (Path, Address)) and options.output != DASH and form.suffix in TREES
+    return options.writing.settings(
+        ctx,
+        form,
+        method=options.method or (QUALITY if form.manifest else METHODS[0]),
+        base=options.base,
+        growth=options.growth or (DETAIL_GROWTH if form.manifest else DEFAULT_GROWTH),
+        detail=options.detail if form.name == DETAIL else None,
+        tiles=options.tiles if form.name == TILED else None,
+        environment=options.environment,
+        environment_beyond=options.environment_beyond,
+        refine=refine,
+        camera_path=options.camera_path,
+        converts=options.form is not None or names_tree or bool(form.manifest),
+    )
+
+
+def report(
+    ctx: click.Context, console: Console, source: Source, output: Place, outcome: Outcome | Converted, *, as_json: bool
+) -> None:
+    """Print the result for an input, as JSON, too, if requested; exit after Ctrl-C, which ends fitting early."""
+    name = name_of(source)
     if isinstance(outcome, SparklodError):
-        return {**record, "error": shortened(str(outcome), MOST)}
-    more = {"skipped": True} if outcome is None else dataclasses.asdict(outcome)
-    return {**record, "output": str(target), **more}
+        console.error(f"{name}: {outcome}")
+        result: dict[str, Any] = {"error": shortened(str(outcome), MOST)}
+    elif outcome is None:
+        console.say(f"{name}  ->  {output}  exists already")
+        result = {"output": str(output), "skipped": True}
+    else:
+        target = "standard output" if output == DASH else str(output)
+        for number, line in enumerate(_lines(outcome, name, target, verbose=console.verbose)):
+            console.say(f"  {line}" if number else line)
+        result = {"output": str(output), **dataclasses.asdict(outcome)}
+    if as_json:
+        if isinstance(source, (Path, Address)):
+            print_json({"input": str(source)} | result)
+        else:
+            print_json({"inputs": [str(file) for file, _ in source.files]} | result)
+    if interrupts.came.is_set():
+        console.clear()
+        say("interrupted")
+        ctx.exit(interrupts.INTERRUPTED)
 
 
-#: What clamping does to a scene and what to do about it, by column of `Splats` and whether the upper end clamps.
-CLAMPED_BY_SPZ = {
-    ("scale", False): ("scales", "mostly how thick flat splats are; --format rad keeps them"),
-    ("scale", True): ("scales", "such splats, of a sky perhaps, shrink; --format rad keeps them"),
-    ("rgb", False): ("colours", "darker than black, so the loss is hardly visible"),
-    ("rgb", True): ("colours", "brighter than white, so the loss is hardly visible"),
-    ("sh", False): ("SH", "reflections get weaker; render --diff shows whether it matters"),
-    ("sh", True): ("SH", "reflections get weaker; render --diff shows whether it matters"),
-}
-_THIN, _WIDE = "mostly how thick flat splats are; --rad-scales ln_f16 keeps them", "--rad-scales ln_f16 keeps them"
-_FAR, _COLORS = "--rad-center f32_lebytes keeps them", "the loss is hardly visible; --rad-rgb {wide} keeps them"
-#: The visible effect of clamping values below the lower end, and above the upper one.
-CONSEQUENCES = {
-    "center": ("splats are farther away", "splats are farther away"),
-    "scale": ("splats are smaller", "splats are larger"),
-    "rgb": ("colours are darker", "colours are brighter"),
-    "sh": ("reflections are stronger", "reflections are stronger"),
-}
-#: "{wide}" is the encoding that holds the values.
-CLAMPED_BY_RAD = {
-    ("center", True): ("coordinates", _FAR),
-    ("scale", False): ("scales", _THIN),
-    ("scale", True): ("scales", _WIDE),
-    ("rgb", False): ("colours", _COLORS),
-    ("rgb", True): ("colours", _COLORS),
-    ("sh", True): ("SH", "reflections get weaker; --rad-sh {wide} keeps them"),
+#: By column of `Splats`: nouns for its values in a bake and in a scene, and the visible effects of clamping them at the
+#: lower and at the upper end of their range.
+COLUMNS = {
+    "center": ("coordinates", "centres", "splats are farther away", "splats are farther away"),
+    "scale": ("scales", "scales", "splats are smaller", "splats are larger"),
+    "rgb": ("colours", "colours", "colours are darker", "colours are brighter"),
+    "sh": ("SH", "reflections (SH)", "reflections are stronger", "reflections are stronger"),
 }
 
-#: Words for columns of which leaves have values that an output clamps, and the share of splats from which it is said.
-COLUMNS = {"center": "centres", "scale": "scales", "rgb": "colours", "sh": "reflections (SH)"}
+_WEAKER = "reflections get weaker; render --diff shows whether it matters"
+_THIN, _HARDLY = "mostly how thick flat splats are", "so the loss is hardly visible"
+_WIDE_SCALES, _WIDE_RGB = "--rad-scales ln_f16 keeps them", "the loss is hardly visible; --rad-rgb {wide} keeps them"
+#: By format and column: advice on values clamped at the lower end, and at the upper one; "{wide}" is the encoding that
+#: holds the values.
+ADVICE = {
+    ("SPZ", "scale"): (
+        f"{_THIN}; --format rad keeps them",
+        "such splats, of a sky perhaps, shrink; --format rad keeps them",
+    ),
+    ("SPZ", "rgb"): (f"darker than black, {_HARDLY}", f"brighter than white, {_HARDLY}"),
+    ("SPZ", "sh"): (_WEAKER, _WEAKER),
+    ("RAD", "center"): ("", "--rad-center f32_lebytes keeps them"),
+    ("RAD", "scale"): (f"{_THIN}; {_WIDE_SCALES}", _WIDE_SCALES),
+    ("RAD", "rgb"): (_WIDE_RGB, _WIDE_RGB),
+    ("RAD", "sh"): ("", "reflections get weaker; --rad-sh {wide} keeps them"),
+}
+
+#: Share of splats from which on a scene without a tree gets a line on clamped or faint ones.
 LEAST_SHARE = 0.001
 
 
-def report_baked(console: Console, source: Source, target: str, baked: Baked) -> None:
-    """Print a line about the file, and one for each thing that a person should know."""
+def _lines(made: Baked | Converted, name: str, target: str, *, verbose: bool) -> Iterator[str]:
+    """Yield a line about an output, then one for each thing that a person should know."""
+    from ..bake.settings import Baked
+    from ..model.selection import describe
+
+    splats, simplified = count_of(made.splats, "splat"), None
+    read = f"{splats}, SH {made.sh_degree}"
+    if isinstance(made, Baked):
+        losses: Losses | None = made.simplified
+        simplified, contents = made.simplified, _contents(made)
+    else:
+        losses = made
+        arrays = ", ".join(f"{name} uint32{list(shape)}" for name, shape in made.arrays.items())
+        contents, read = arrays or read, splats if made.nodes is None else count_of(made.nodes, "node")
+    seconds = sum(made.seconds.values())
+    yield f"{name}  {read}  ->  {target}  {contents}, {format_size(made.bytes)}, {seconds:.1f} s"
+    if isinstance(made, Baked):
+        yield from _notes(made)
+    if made.dropped:
+        yield f"left out: {describe(made.dropped)}"
+    yield from made.notes if isinstance(made, Baked) else ()
+    stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in made.seconds.items())
+    if losses is None:
+        assert isinstance(made, Baked)
+        yield from _clamping(made, verbose=verbose)
+        tree = f"{made.method} tree" if made.method is not None else "the same tree"
+        tree += ", refined" if made.refine is not None else ""
+        about = f"{made.format} -> {tree} -> {_encoding(made)}"
+    else:
+        if simplified is not None and simplified.faint > LEAST_SHARE * simplified.splats:
+            share = percent_of(simplified.faint / simplified.splats)
+            yield f"{share} of the splats, merged across wide gaps, are too faint to be drawn; keep more splats"
+        yield from _losses(losses, made.splats if simplified is None else simplified.splats, made.output_format)
+        about = made.format if isinstance(made, Baked) else f"{made.format} -> {made.output_format}"
+    if verbose:
+        yield f"{about}; {stages}"
+    if verbose and isinstance(made, Baked) and made.blocks is not None:
+        written, read = (format_size(size or 0) for size in (made.scratch_bytes_written, made.scratch_bytes_read))
+        yield f"out of core in {count_of(made.blocks, 'block')}; scratch: {written} written, {read} read"
+
+
+def _contents(baked: Baked) -> str:
     made, detail, tiles = baked.simplified, baked.detail, baked.tiles
     if made is not None:
         measured = "" if made.psnr is None else f", PSNR {made.psnr:.2f} dB"
-        contents = f"{count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}"
-    elif tiles is not None:
+        return f"{count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}"
+    if tiles is not None:
         place = ", on the Earth" if tiles.georeferenced else ""
-        contents = f"{count_of(tiles.tiles, 'tile')} of {count_of(tiles.levels, 'level')}{place}"
-    elif detail is not None:
+        return f"{count_of(tiles.tiles, 'tile')} of {count_of(tiles.levels, 'level')}{place}"
+    if detail is not None:
         environment = f", environment of {count_of(detail.environment, 'splat')}" if detail.environment else ""
-        contents = (
+        return (
             f"{count_of(len(detail.levels), 'detail level')} of {count_of(detail.regions, 'region')},"
             f" {count_of(detail.chunks, 'chunk file')}{environment}"
         )
-    else:
-        chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
-        contents = f"{count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks}"
-    console.say(
-        f"{name_of(source)}  {count_of(baked.splats, 'splat')}, SH {baked.sh_degree}  ->  {target} "
-        f" {contents}, {format_size(baked.bytes)}, {sum(baked.seconds.values()):.1f} s"
-    )
-    if detail is not None and len(detail.levels) > 1:
-        levels = (
-            f"{level.splats:,} splats ({percent_of(level.share)}, error at most {level.worst_error:.2g})"
-            for level in detail.levels[1:]
-        )
-        console.say(f"  levels below full detail: {', '.join(levels)}")
-    if tiles is not None and tiles.levels > 1:
-        console.say(f"  splats level by level: {', '.join(f'{count:,}' for count in tiles.splats)}")
-    refine = baked.refine if made is None else made.refine
-    if refine is not None:
-        console.say(f"  {_refined(refine)}")
-    if baked.dropped:
-        from ..model.selection import describe
-
-        console.say(f"  left out: {describe(baked.dropped)}")
-    for note in baked.notes:
-        console.say(f"  {note}")
-    if made is not None:
-        if made.faint > LEAST_SHARE * made.splats:
-            share = percent_of(made.faint / made.splats)
-            console.say(
-                f"  {share} of the splats, merged across wide gaps, are too faint to be drawn; keep more splats"
-            )
-        _report_losses(console, made, made.splats, baked.output_format)
-        console.detail(f"  {baked.format}; {_stages(baked.seconds)}")
-        return
-    if baked.clamps and (consequences := _consequences(baked)):
-        console.say(f"  {consequences}")
-    if not console.verbose:
-        return
-    for clamp in baked.clamps:
-        console.say(f"  {_clamped(clamp, baked)}")
-    tree = f"{baked.method} tree" if baked.method is not None else "the same tree"
-    tree += ", refined" if baked.refine is not None else ""
-    console.say(f"  {baked.format} -> {tree} -> {_written(baked)}; {_stages(baked.seconds)}")
-    if baked.blocks is not None:
-        written, read = (format_size(size or 0) for size in (baked.scratch_bytes_written, baked.scratch_bytes_read))
-        console.say(f"  out of core in {count_of(baked.blocks, 'block')}; scratch: {written} written, {read} read")
+    chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
+    return f"{count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks}"
 
 
-def _refined(refined: Refined) -> str:
-    gains = [
-        f"{percent_of(share)} {before:.2f} -> {refined.psnr_after[share]:.2f}"
-        for share, before in refined.psnr_before.items()
-    ]
-    seen = f"held-out PSNR {', '.join(gains)} dB" if gains else "no held-out camera sees anything of it"
-    early = "" if refined.is_complete else ", interrupted"
-    return (
-        f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
-        f" {percent_of(refined.kept)} of the splats fitted have new values"
-    )
-
-
-def _written(baked: Baked) -> str:
+def _encoding(baked: Baked) -> str:
     if baked.detail is not None:
-        return "Streamed SOG"
+        return DETAIL
     if baked.tiles is not None:
-        return "3D Tiles"
+        return TILED
     if baked.chunks is None:
         return f"SPZ {baked.version} LoD, {baked.fractional_bits} fractional bits"
     palette = f", a palette of {baked.sh_codes:,} SH" if baked.sh_codes else ""
@@ -584,70 +510,72 @@ def _written(baked: Baked) -> str:
     return f"RAD LoD, {encodings}{palette}"
 
 
-def _consequences(baked: Baked) -> str:
-    """Return a line on the visible effects of clamping; empty without any."""
-    from ..codecs.losses import clamp_matters
+def _notes(baked: Baked) -> Iterator[str]:
+    """Yield lines on levels and on fitting."""
+    if baked.detail is not None and len(baked.detail.levels) > 1:
+        levels = (
+            f"{level.splats:,} splats ({percent_of(level.share)}, error at most {level.worst_error:.2g})"
+            for level in baked.detail.levels[1:]
+        )
+        yield f"levels below full detail: {', '.join(levels)}"
+    if baked.tiles is not None and baked.tiles.levels > 1:
+        yield f"splats level by level: {', '.join(f'{count:,}' for count in baked.tiles.splats)}"
+    refined = baked.refine if baked.simplified is None else baked.simplified.refine
+    if refined is not None:
+        gains = [
+            f"{percent_of(share)} {before:.2f} -> {refined.psnr_after[share]:.2f}"
+            for share, before in refined.psnr_before.items()
+        ]
+        seen = f"held-out PSNR {', '.join(gains)} dB" if gains else "no held-out camera sees anything of it"
+        early = "" if refined.is_complete else ", interrupted"
+        yield (
+            f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
+            f" {percent_of(refined.kept)} of the splats fitted have new values"
+        )
 
+
+def _clamping(baked: Baked, *, verbose: bool) -> Iterator[str]:
+    """Yield a line on the visible effects of clamping, and details of it."""
+    if not baked.clamps:
+        return
+    from ..codecs.losses import clamp_matters
+    from ..codecs.rad.property_codings import LARGEST_F16
+
+    form, more = "RAD", "-v says what keeps them"
+    if baked.chunks is None:
+        form, more = "SPZ", "--format rad keeps more of them"
     shares: dict[str, float] = {}
     for clamp in baked.clamps:
         if clamp_matters(clamp.column, above=clamp.above, visible=clamp.visible, leaves=baked.splats):
-            text = CONSEQUENCES[clamp.column][clamp.above]
-            shares[text] = max(shares.get(text, 0.0), clamp.visible / baked.splats)
-    if not shares:
-        return ""
-    form, more = (
-        ("SPZ", "--format rad keeps more of them") if baked.chunks is None else ("RAD", "-v says what keeps them")
-    )
-    losses = " and ".join(f"{percent_of(share, 2)} of {text}" for text, share in shares.items())
-    return f"{losses} than {form} can hold; {more}"
+            effect = COLUMNS[clamp.column][2 + clamp.above]
+            shares[effect] = max(shares.get(effect, 0.0), clamp.visible / baked.splats)
+    if shares:
+        losses = " and ".join(f"{percent_of(share, 2)} of {effect}" for effect, share in shares.items())
+        yield f"{losses} than {form} can hold; {more}"
+    for clamp in baked.clamps if verbose else ():
+        degree = f" of degree {clamp.degree}" if clamp.degree else ""
+        share = f"{count_of(clamp.splats, 'node')} ({percent_of(clamp.splats / baked.nodes)})"
+        where, way = ("above", "up") if clamp.above else ("below", "down")
+        where = "beyond ±" if clamp.both else f"{where} "
+        farthest = clamp.farthest or 0.0  # no -0
+        advice = ADVICE[form, clamp.column][clamp.above]
+        advice = advice.format(wide="f16" if abs(farthest) <= LARGEST_F16 else "f32")
+        yield (
+            f"{COLUMNS[clamp.column][0]}{degree} of {share} are {where}{clamp.end:.3g}, {way} to {farthest:.3g},"
+            f" and are clamped to what {form} holds: {advice}"
+        )
 
 
-def _clamped(clamp: Clamp, baked: Baked) -> str:
-    """Return a line on clamped values: the number of nodes, the largest value, and the consequence."""
-    from ..codecs.rad.property_codings import LARGEST_F16
-
-    form, table = ("SPZ", CLAMPED_BY_SPZ) if baked.chunks is None else ("RAD", CLAMPED_BY_RAD)
-    name, advice = table[clamp.column, clamp.above]
-    share = f"{count_of(clamp.splats, 'node')} ({percent_of(clamp.splats / baked.nodes)})"
-    name += f" of degree {clamp.degree}" if clamp.degree else ""
-    where, way = ("above", "up") if clamp.above else ("below", "down")
-    where = "beyond ±" if clamp.both else f"{where} "
-    farthest = clamp.farthest or 0.0  # no -0
-    advice = advice.format(wide="f16" if abs(farthest) <= LARGEST_F16 else "f32")
-    return (
-        f"{name} of {share} are {where}{clamp.end:.3g}, {way} to {farthest:.3g}, and are clamped to what {form} holds:"
-        f" {advice}"
-    )
-
-
-def report_converted(console: Console, source: Place, target: str, made: Converted) -> None:
-    """Print a line about splats or arrays, and what their format does not hold."""
-    from ..model.selection import describe
-
-    read = count_of(made.splats if made.nodes is None else made.nodes, "splat" if made.nodes is None else "node")
-    arrays = ", ".join(f"{name} uint32{list(shape)}" for name, shape in made.arrays.items())
-    written = arrays or f"{count_of(made.splats, 'splat')}, SH {made.sh_degree}"
-    seconds = sum(made.seconds.values())
-    console.say(f"{name_of(source)}  {read}  ->  {target}  {written}, {format_size(made.bytes)}, {seconds:.1f} s")
-    if made.dropped:
-        console.say(f"  left out: {describe(made.dropped)}")
-    _report_losses(console, made, made.splats, made.output_format)
-    console.detail(f"  {made.format} -> {made.output_format}; {_stages(made.seconds)}")
-
-
-def _report_losses(console: Console, losses: Losses, splats: int, form: str) -> None:
-    lines = ["holds no reflections (SH)"] if losses.drops_sh else []
-    lines += [
-        f"clamps the {COLUMNS[column]} of {percent_of(count / splats)} of the splats"
+def _losses(losses: Losses, splats: int, form: str) -> Iterator[str]:
+    """Yield lines on what a format does not hold of a scene without a tree."""
+    parts = ["holds no reflections (SH)"] if losses.drops_sh else []
+    parts += [
+        f"clamps the {COLUMNS[column][1]} of {percent_of(count / splats)} of the splats"
         for column, count in losses.clamped.items()
         if count >= LEAST_SHARE * splats
     ]
-    if lines:
-        console.say(f"  {form} {', and '.join(lines)}")
+    if parts:
+        yield f"{form} {', and '.join(parts)}"
     if losses.up_lost is not None:
         up = losses.up_lost
-        console.say(f"  {up} is up, which this format cannot note; give --up={up} to render, traverse and view")
-
-
-def _stages(seconds: dict[str, float]) -> str:
-    return ", ".join(f"{stage} {value:.2f} s" for stage, value in seconds.items())
+        yield f"{up} is up, which this format cannot note; give --up={up} to render, traverse and view"

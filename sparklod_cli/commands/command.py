@@ -260,13 +260,6 @@ def values_of(ctx: click.Context, kind: type[Options]) -> Options:
         raise click.UsageError(str(error)) from None
 
 
-def parameters_of(*kinds: type[Any]) -> tuple[str, ...]:
-    """Return the names of the parameters of groups, without those of groups in them."""
-    return tuple(
-        declared.name or field.name for kind in kinds for field, declared in settings_in(kind) if declared is not None
-    )
-
-
 COLORS: dict[str, tuple[float, ...] | None] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 
 #: Pixels along a side of a picture, and digits of no more than a few times that.
@@ -322,26 +315,6 @@ class Text(click.ParamType):
         except ValueError:
             self.fail(f"{value!r} is out of range; give {quantity.range}", param, ctx)
         return parsed
-
-
-class OptionalNumber(click.IntRange):
-    """A number that may be left out; `zero` is a text for 0, which may be out of the range."""
-
-    def __init__(self, range: Range, *, placeholder: str = "N", example: int, zero: str = "") -> None:
-        super().__init__(range.least, range.most)  # type: ignore[arg-type]  # whole numbers
-        self.placeholder, self.example, self.zero = placeholder, example, zero
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        if self.zero and value == self.zero:
-            return 0
-        if isinstance(value, str) and not value.lstrip("-").isdigit() and param is not None:
-            flag, example = param.opts[0], f"{param.opts[0]}={self.example}"
-            self.fail(f"{value!r} is no number; put {flag} after the inputs, or write {example}", param, ctx)
-        number: int = super().convert(value, param, ctx)
-        return number
-
-    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        return f"[{self.placeholder}]"
 
 
 def _numbers(text: str, names: str = "x,y,z") -> tuple[float, ...]:

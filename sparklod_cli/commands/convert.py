@@ -8,36 +8,16 @@ from typing import Any
 import click
 
 from ..codecs.formats import ENCODINGS, WRITABLE
-from ..codecs.options import WriteOptions
 from ..system.addresses import Place
 from ..system.errors import FormatError, InvalidSplatsError, OutOfMemoryError, naming
-from ..system.setting_fields import setting, setting_of
+from ..system.setting_fields import setting
 from ..system.stdio import DASH, name_of
-from .build_lod import BuildLodOptions, record_of, report_baked, report_converted
+from .build_lod import report
 from .command import COMMON, Command, flag, values_of
-from .console import Console, print_json
-from .option_groups import (
-    EACH_AS_JSON,
-    JSON,
-    OVERWRITE,
-    SCENE_HEADINGS,
-    General,
-    SceneOptions,
-    bake_settings,
-)
-from .outputs import (
-    ARRAYS,
-    FORMS,
-    PLAIN_FORMS,
-    Folder,
-    NamedPath,
-    Target,
-    claim_stdout,
-    keep_apart,
-    name_outputs,
-    shown,
-)
-from .rules import check
+from .console import Console
+from .option_groups import OVERWRITE
+from .outputs import Folder, NamedPath, name_outputs
+from .writing_options import ARRAYS, FORMS, PLAIN_FORMS, SCENE_HEADINGS, Form, Writing, check_outputs, form_of
 
 EXAMPLES = """\
   sparklod convert scene.ply scene.sog              # for PlayCanvas
@@ -79,12 +59,7 @@ class ConvertOptions:
         heading=COMMON,
     )
     overwrite: bool = flag(**OVERWRITE)
-    max_sh: int = setting_of(BuildLodOptions, "max_sh")
-    scene: SceneOptions = field(default_factory=SceneOptions)
-    written: WriteOptions = field(default_factory=WriteOptions)
-    cluster_sh: int | None = setting_of(BuildLodOptions, "cluster_sh")
-    as_json: bool = flag(EACH_AS_JSON, **JSON)
-    general: General = field(default_factory=General)
+    writing: Writing = field(default_factory=Writing)
 
 
 @click.command("convert", cls=Command, options=ConvertOptions, examples=EXAMPLES, headings=SCENE_HEADINGS)
@@ -99,31 +74,23 @@ def convert(ctx: click.Context, /, **_: Any) -> None:
 
     --layout writes arrays as viewers have them in memory.
     """
-    form = ctx.params["form"]
-    if isinstance(ctx.params["output"], Folder) and form is None:
+    choice = ctx.params["form"]
+    if isinstance(ctx.params["output"], Folder) and choice is None:
         raise click.UsageError(f"OUT is a folder; name the file in it, or add --format, such as {', '.join(NAMES[:3])}")
-    name_outputs(ctx, ctx.params["source"], FORMS[form].suffix if form else "")
+    name_outputs(ctx, ctx.params["source"], FORMS[choice].suffix if choice else "")
     options = values_of(ctx, ConvertOptions)
-    general, source, output, target = options.general, options.source, options.output, Target.of(options.output, form)
-    _check(ctx, options, target)
+    writing, general, source, output = options.writing, options.writing.general, options.source, options.output
+    form = form_of(output, choice)
+    _check(ctx, options, form)
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
-        from ..api.converting import Converted, convert_file
+        from ..api.converting import convert_file
 
         console.announce_compiling()
         with naming(name_of(source), (FormatError, InvalidSplatsError, OutOfMemoryError)):
             made = convert_file(
                 source,
                 output,
-                bake_settings(
-                    ctx,
-                    target.form,
-                    options.scene,
-                    options.written,
-                    options.cluster_sh,
-                    max_sh=options.max_sh,
-                    converts=True,
-                    recodes=True,
-                ),
+                writing.settings(ctx, form, converts=True, recodes=True),
                 layout=options.layout,
                 leaves=options.leaves,
                 overwrite=options.overwrite,
@@ -131,26 +98,18 @@ def convert(ctx: click.Context, /, **_: Any) -> None:
                 progress=console.progress,
                 say=console.say,
             )
-        if isinstance(made, Converted):
-            report_converted(console, source, shown(output), made)
-        else:
-            report_baked(console, source, shown(output), made)
-        if options.as_json:
-            print_json(record_of(source, output, made))
+        report(ctx, console, source, output, made, as_json=writing.as_json)
 
 
-def _check(ctx: click.Context, options: ConvertOptions, target: Target) -> None:
+def _check(ctx: click.Context, options: ConvertOptions, form: Form) -> None:
     """Raise a `click.UsageError` where options contradict each other, or the name of the output."""
-    form, output, endings = target.form, options.output, (*WRITABLE, *ARRAYS)
-    if options.form is None and output == DASH:
+    endings = (*WRITABLE, *ARRAYS)
+    if options.form is None and options.output == DASH:
         raise click.UsageError("standard output has no name, which chooses the format; add --format")
-    target.check_name("OUT", WRITABLE)
     if form.manifest:
-        raise click.UsageError(f"{form.manifest} consists of cuts of a tree; build-lod -o {output} makes them")
+        raise click.UsageError(f"{form.manifest} consists of cuts of a tree; build-lod -o {options.output} makes them")
     if form.suffix not in endings:
         raise click.UsageError(f"OUT ends in {', '.join(endings)}, not {form.suffix}")
     if form.suffix in ARRAYS and options.layout is None:
         raise click.UsageError(f"{form.suffix} holds arrays; choose their --layout: {', '.join(ENCODINGS)}")
-    check(ctx, format=form.name, suffix=form.suffix)
-    keep_apart(ctx, {"output": target.files([output])})
-    claim_stdout(ctx, "output", as_json=options.as_json, binary=True)
+    check_outputs(ctx, form, [options.output], WRITABLE, suffix=form.suffix)

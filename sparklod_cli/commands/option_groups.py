@@ -1,8 +1,7 @@
-"""Options that several commands have: general ones, tables, scenes and how they are written."""
+"""Options of several commands: general ones, and those of tables."""
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import sys
 from collections.abc import Iterable, Sequence
@@ -12,27 +11,16 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from ..codecs.options import SogOptions, WriteOptions
-from ..lod.tree_settings import BUILDERS
-from ..model import UP_AXES
 from ..system.errors import CHECK_FAILED
-from ..system.setting_fields import Range, setting, whole
+from ..system.setting_fields import setting, whole
 from ..system.stdio import DASH
-from ..system.units import parse_size
-from .command import BALL, COMMON, GENERAL, POINT, flag, parameters_of
+from .command import COMMON, GENERAL, flag
 from .console import Console, is_terminal
-from .outputs import Form, NamedPath, require_suffix
-from .rules import flags_set
+from .outputs import NamedPath, require_suffix
 
 if TYPE_CHECKING:
-    from ..bake.settings import BakeSettings
-    from ..model.transforms import Transform
     from ..tables.assertions import Assertion, Outcome
     from ..tables.columns import Column, TableOutput
-
-#: Headings of `--help` of options of scenes.
-SELECTION, POSITION, FILE_FORMAT = "Selection", "Rotation, scale and position", "File format"
-SCENE_HEADINGS = (COMMON, SELECTION, POSITION, FILE_FORMAT, "RAD")
 
 #: Largest accepted number of threads.
 MAX_THREADS = 256
@@ -132,114 +120,3 @@ def parse_asserts(texts: Sequence[str], columns: Sequence[Column]) -> list[Asser
         return [parse(text, columns) for text in texts]
     except BadAssertionError as error:
         raise click.UsageError(f"--assert {error}") from None
-
-
-# Scenes
-
-
-@dataclass(frozen=True)
-class SceneOptions:
-    """Options of which splats of the input are kept, and how the scene is turned, scaled and moved."""
-
-    min_opacity: float = setting(
-        "Leave out splats whose opacity is lower than this.", Range(0, 1, unit="N"), 0.0, heading=COMMON
-    )
-    within: Any = setting(
-        "Leave out splats whose centre is outside this ball, in the input's coordinates.", BALL, heading=COMMON
-    )
-    min_box: tuple[float, ...] | None = setting(
-        "Leave out splats whose centre is below this on any axis, in the input's coordinates.", POINT, heading=SELECTION
-    )
-    max_box: tuple[float, ...] | None = setting(
-        "Leave out splats whose centre is above this on any axis, in the input's coordinates.", POINT, heading=SELECTION
-    )
-    on_invalid: str = setting(
-        "Whether to fail on invalid splats or leave them out: numbers that are not finite, negative scales.",
-        ("error", "drop"),
-        "error",
-        heading=SELECTION,
-    )
-    rgba: Path | None = setting(
-        "Replace colours and opacities by those of a .npy or raw file of (N, 4) bytes or floats 0..1; splats of alpha 0"
-        " are left out.",
-        NamedPath(),
-        heading=SELECTION,
-    )
-    up: str | None = setting(
-        "Axis that is up in the input: turn it to +y, and note that in the output for render, traverse and view."
-        " y turns nothing; scenes as trained are mostly -y.  [default: note what the file says, and turn nothing]",
-        UP_AXES,
-        heading=COMMON,
-    )
-    rotate: tuple[float, ...] = setting(
-        "Turn the scene by these angles in degrees, about x, then y, then z, after --up.  [default: 0,0,0]",
-        POINT,
-        (0.0, 0.0, 0.0),
-        heading=POSITION,
-    )
-    scale: float = setting(
-        "Multiply the size of the scene by this, about its origin, after --rotate.",
-        Range(above=0),
-        1.0,
-        heading=POSITION,
-    )
-    translate: tuple[float, ...] = setting(
-        "Move the scene by this, in world units, after --scale.  [default: 0,0,0]",
-        POINT,
-        (0.0, 0.0, 0.0),
-        heading=POSITION,
-    )
-
-    @property
-    def transform(self) -> Transform | None:
-        """Transform of the splats; None for the identity."""
-        parts = {"up": self.up or UP_AXES[0], "rotate": self.rotate, "scale": self.scale, "translate": self.translate}
-        if parts == {"up": UP_AXES[0], "rotate": (0, 0, 0), "scale": 1, "translate": (0, 0, 0)}:
-            return None
-        from ..model.transforms import Transform
-
-        try:
-            return Transform.from_parts(**parts)  # type: ignore[arg-type]
-        except ValueError as error:
-            raise click.UsageError(str(error)) from None
-
-
-#: Parameters without an effect on an input that has a tree, of any command.
-_BUILT = ("method", "max_sh", *(builder.setting for builder in BUILDERS.values()))
-OF_TREES = (*_BUILT, *parameters_of(SceneOptions), "environment_beyond")
-
-
-def bake_settings(
-    ctx: click.Context, form: Form, scene: SceneOptions, written: WriteOptions, sh_codes: int | None, **more: Any
-) -> BakeSettings:
-    """Return the settings of a bake or conversion, `more` among them; loads numpy."""
-    from ..bake.settings import BakeSettings
-    from ..model.selection import Selection
-
-    rad = dataclasses.replace(written.rad, chunked=form.chunked, sh_codes=sh_codes)
-    return BakeSettings(
-        suffix=form.suffix,
-        options=dataclasses.replace(written, rad=rad, sog=SogOptions(sh_codes)),
-        selection=Selection(
-            drop_invalid=scene.on_invalid == "drop",
-            min_opacity=scene.min_opacity,
-            min_box=scene.min_box,  # type: ignore[arg-type]
-            max_box=scene.max_box,  # type: ignore[arg-type]
-            within=scene.within,
-        ),
-        transform=scene.transform,
-        up=scene.up,
-        rgba=scene.rgba,
-        unused=tuple(flags_set(ctx, OF_TREES)),
-        **more,
-    )
-
-
-def memory_size(text: str) -> int:
-    """Parse an amount of memory such as 4G or "600 MB"; raise `ValueError` for one without a unit."""
-    size = parse_size(text)
-    if not text.strip()[-1:].isalpha():
-        raise ValueError(f"{text!r} has no unit; write {text.strip()}G or {text.strip()}MB")
-    if size < 1:
-        raise ValueError(f"{text!r} must be positive, such as 4G")
-    return size

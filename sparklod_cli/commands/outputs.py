@@ -5,18 +5,16 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 
-from ..codecs.formats import MANIFEST, META, NPZ, RAW_SUFFIXES, TILESET, WRITABLE, ending_of
+from ..codecs.formats import MANIFEST, META, TILESET
 from ..system.addresses import Address, Place, place_of
 from ..system.stdio import DASH
-from .console import is_terminal
 from .rules import flag_of
 
 INPUT, OUTPUT = "an input", "an output"
@@ -71,113 +69,6 @@ class NamedPath(click.Path):
             return place
         is_folder = text.endswith(("/", os.sep)) or (isinstance(place, Path) and os.path.isdir(place))  # noqa: PTH112
         return Folder(place) if is_folder else place
-
-
-class Form(NamedTuple):
-    """Format and files of an output of scenes.
-
-    Attributes:
-        name: of the format; "--layout" for arrays, and empty for an ending that no format has.
-        suffix: ending of the name, as `WRITABLE` knows it, or that of arrays.
-        chunked: each chunk of a RAD gets a file of its own.
-        manifest: name of the first file of a format that has cuts of a tree and not the tree; otherwise empty.
-        beside: the files beside the manifest, for display.
-    """
-
-    name: str
-    suffix: str
-    chunked: bool = False
-    manifest: str = ""
-    beside: str = ""
-
-
-#: Values of --format: those of trees and their cuts, and those of plain splats and arrays.
-TREE_FORMS = {
-    "spz": Form("SPZ", ".spz"),
-    "rad": Form("RAD", ".rad"),
-    "rad-chunked": Form("RAD", ".rad", chunked=True),
-    "streamed-sog": Form("Streamed SOG", ".json", manifest=MANIFEST, beside="folders"),
-    "3d-tiles": Form("3D Tiles", ".json", manifest=TILESET, beside="a folder"),
-}
-ARRAYS = (NPZ, *RAW_SUFFIXES)
-PLAIN_FORMS = {
-    **{end[1:]: Form(form.name, end) for end, form in WRITABLE.items() if not form.trees and end.startswith(".")},
-    **{suffix[1:]: Form("--layout", suffix) for suffix in ARRAYS},
-}
-FORMS = TREE_FORMS | PLAIN_FORMS
-
-
-def _form_of(name: str) -> Form:
-    """Return the form of a file by its name; that of SPZ without one."""
-    ending = ending_of(name) or ".spz"
-    known = [form for form in FORMS.values() if form.manifest == name or (form.suffix == ending and not form.manifest)]
-    return known[0] if known else Form(WRITABLE[ending].name if ending in WRITABLE else "", ending)
-
-
-@dataclass(frozen=True)
-class Target:
-    """Output of scenes: what its name and --format say.
-
-    Attributes:
-        file: the output, - for standard output; None where outputs are named after their inputs.
-        folder: of outputs that are named after their inputs; None for that of each input.
-        choice: value of --format; None where the name of the output chooses.
-    """
-
-    file: Place | None
-    folder: Place | None
-    choice: str | None
-    form: Form
-
-    @classmethod
-    def of(cls, output: Place | Folder | None, choice: str | None = None, folder: Place | None = None) -> Target:
-        """Return the target of --output, --format and --output-dir."""
-        if isinstance(output, Folder):
-            return cls(None, output.path, choice, FORMS[choice or "spz"])
-        name = "" if output is None or output == DASH else output.name
-        return cls(output, folder, choice, _form_of(name) if choice is None else FORMS[choice])
-
-    @property
-    def kind(self) -> str:
-        """Kind of the output, a fact of the rules."""
-        return "standard output" if self.file == DASH else "folder" if self.file is None else "file"
-
-    def files(self, outputs: Iterable[Place]) -> list[Place]:
-        """Return outputs, and the files beside them that are replaced or removed with them."""
-        if not self.form.chunked and not self.form.manifest and self.form.suffix != META:
-            return list(outputs)
-        from ..io.writing import siblings_of
-
-        files = list[Place]()
-        for header in outputs:
-            files.append(header)
-            if isinstance(header, Path):
-                target = Path(os.path.realpath(header))
-                files += [target.parent / name for name in siblings_of(header).existing(target)]
-        return files
-
-    def check_name(self, flag: str, endings: Iterable[str]) -> None:
-        """Raise a `click.UsageError` where the name of the output contradicts --format, or has no suffix."""
-        file, form, choice = self.file, self.form, self.choice
-        if file is None:
-            return
-        if choice is None:
-            require_suffix(flag, file, endings)
-        elif (form.manifest or form.chunked) and file == DASH:
-            example = form.manifest or f"scene{form.suffix}"
-            raise click.UsageError(f"--format {choice} writes several files; name the output, such as web/{example}")
-        elif form.manifest and file.name != form.manifest:
-            raise click.UsageError(
-                f"--format {choice} writes {form.manifest} and {form.beside} beside it, not {file.name}; name the"
-                f" output {file.parent / file.stem / form.manifest}"
-            )
-        elif not form.manifest and ending_of(file.name) not in ("", form.suffix):
-            raise click.UsageError(f"--format {choice} writes {form.suffix}, not {ending_of(file.name)}")
-
-
-def shown(output: Place) -> str:
-    """Return the name of an output for messages."""
-    return "standard output" if output == DASH else str(output)
 
 
 def name_outputs(ctx: click.Context, source: Place | None, ending: str = "") -> None:
@@ -263,21 +154,6 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
             raise click.BadParameter(
                 f"{str(path)!r} does not end in {' or '.join(kind.suffixes)}, which is what is written", ctx, parameter
             )
-
-
-def claim_stdout(ctx: click.Context, name: str, *, as_json: bool, binary: bool = False) -> None:
-    """Raise a `click.UsageError` where an output is - and standard output is taken or unsuitable.
-
-    Args:
-        binary: a terminal cannot show the output.
-    """
-    if ctx.params[name] != DASH:
-        return
-    flag = flag_of(ctx, name)
-    if as_json:
-        raise click.UsageError(f"{flag} - and --json cannot both go to standard output; name a file")
-    if binary and is_terminal(sys.stdout):
-        raise click.UsageError(f"{flag} - writes binary data; redirect it to a file or a pipe")
 
 
 def is_same_place(one: Place, other: Place) -> bool:

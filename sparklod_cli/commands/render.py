@@ -23,7 +23,7 @@ from ..viewers.viewer_settings import BLEND, StreamingSettings
 from .command import COLOR, COMMON, VIEW, Command, flag, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
 from .option_groups import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, parse_asserts, report_outcomes, table_output
-from .outputs import Folder, NamedPath, claim_stdout, keep_apart, name_outputs, require_suffix, stem_of
+from .outputs import Folder, NamedPath, keep_apart, name_outputs, require_suffix, stem_of
 from .rules import check, is_set
 from .viewing_options import (
     AROUND_SCENE,
@@ -259,7 +259,6 @@ def render(ctx: click.Context, /, **_: Any) -> None:
     if not look.render.raster.near < look.render.raster.far:
         near, far = look.render.raster.near, look.render.raster.far
         raise click.UsageError(f"--near {near:g} must be less than --far {far:g}")
-    claim_stdout(ctx, "output", as_json=options.as_json)
     if options.compare:
         ctx.exit(_compare(ctx, options))
     if options.thumbnail:

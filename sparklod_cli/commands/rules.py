@@ -7,10 +7,13 @@ NAME=VALUE, which holds if a parameter or fact has that value.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import click
+
+from .console import is_terminal
 
 
 class Rule(NamedTuple):
@@ -85,6 +88,26 @@ RULES = (
     Rule(BUILD, ("inputs",), excludes=("scene",), why=NAMES_FILES),
     Rule(CAMERAS, ("files",), excludes=("scene",), why=NAMES_FILES),
     Rule(BUILD, ("output",), excludes=("output_dir",)),
+    Rule(
+        BUILD,
+        ("output",),
+        only_for=("count=1", "merge", "scene", "place=folder"),
+        why="takes one input, not {count}; add --merge to bake them as one scene, or name a folder",
+    ),
+    Rule(
+        BAKES + CAMERAS,
+        ("output",),
+        excludes=("as_json",),
+        when=("output=-",),
+        why="- and --json cannot both go to standard output; name a file",
+    ),
+    Rule(
+        BAKES,
+        ("output",),
+        excludes=("stdout=terminal",),
+        when=("output=-",),
+        why="- writes binary data; redirect it to a file or a pipe",
+    ),
     Rule(BUILD, ("output_dir", "rgba"), excludes=("merge", "scene")),
     Rule(
         BUILD,
@@ -262,7 +285,7 @@ RULES = (
 
 def check(ctx: click.Context, **facts: Any) -> None:
     """Raise a `click.UsageError` where options contradict each other, or the facts that are known so far."""
-    values = {**ctx.params, **facts}
+    values = {**ctx.params, "stdout": "terminal" if is_terminal(sys.stdout) else "file", **facts}
     for rule in RULES:
         if ctx.command.name not in rule.commands or (rule.when and not _holding(ctx, rule.when, values)):
             continue
@@ -315,8 +338,3 @@ def flag_of(ctx: click.Context, name: str) -> str:
     """Return the flag of a parameter, such as --lod-splat-scale for lod_splat_scale, or the name of an argument."""
     param = next(param for param in ctx.command.params if param.name == name)
     return max(param.opts, key=len) if isinstance(param, click.Option) else str(param.metavar).strip("[].")
-
-
-def flags_set(ctx: click.Context, names: Iterable[str]) -> list[str]:
-    """Return the flags of those parameters that were given."""
-    return [flag_of(ctx, name) for name in names if is_set(ctx, name)]

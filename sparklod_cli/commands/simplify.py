@@ -10,7 +10,6 @@ from typing import Any
 import click
 
 from ..codecs.formats import WRITABLE
-from ..codecs.options import WriteOptions
 from ..fitting import STEPS
 from ..fitting.fit_settings import FitSettings
 from ..lod.budget import Budget, doubt, parse_budget
@@ -20,21 +19,13 @@ from ..system.errors import FormatError, SparklodError, naming
 from ..system.setting_fields import Quantity, Range, setting, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
-from .build_lod import BY_SIZE, EXAMPLE_STEPS, QUALITY, BuildLodOptions, exit_if_interrupted, record_of, report_baked
-from .command import COMMON, Command, OptionalNumber, flag, values_of
-from .console import Console, print_json
-from .option_groups import (
-    EACH_AS_JSON,
-    JSON,
-    OVERWRITE,
-    SCENE_HEADINGS,
-    General,
-    SceneOptions,
-    bake_settings,
-    memory_size,
-)
-from .outputs import NamedPath, Target, claim_stdout, keep_apart, name_outputs, shown
-from .rules import GOALS, check, flags_set
+from .build_lod import BY_SIZE, EXAMPLE_STEPS, QUALITY, report
+from .command import COMMON, Command, flag, values_of
+from .console import Console
+from .option_groups import OVERWRITE
+from .outputs import NamedPath, name_outputs
+from .rules import GOALS, is_set
+from .writing_options import MEMORY, SCENE_HEADINGS, OptionalNumber, Writing, check_outputs, form_of
 
 EXAMPLES = """\
   sparklod simplify scene.ply --to 10% -o small.ply
@@ -97,18 +88,12 @@ class SimplifyOptions:
         required=True,
     )
     overwrite: bool = flag(**OVERWRITE)
-    max_sh: int = setting_of(BuildLodOptions, "max_sh")
     memory: int | None = setting(
         "Memory that the tree may take, such as 4G; a scene that needs more is refused."
         "  [default: 75 % of what is available]",
-        Quantity("SIZE", memory_size),
+        MEMORY,
     )
-
-    scene: SceneOptions = field(default_factory=SceneOptions)
-    written: WriteOptions = field(default_factory=WriteOptions)
-    cluster_sh: int | None = setting_of(BuildLodOptions, "cluster_sh")
-    as_json: bool = flag(EACH_AS_JSON, **JSON)
-    general: General = field(default_factory=General)
+    writing: Writing = field(default_factory=Writing)
 
 
 @click.command("simplify", cls=Command, options=SimplifyOptions, examples=EXAMPLES, headings=SCENE_HEADINGS)
@@ -122,23 +107,25 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     """
     name_outputs(ctx, ctx.params["inputs"][0], "-small.spz")
     options = values_of(ctx, SimplifyOptions)
-    general, inputs, output, target = options.general, options.inputs, options.output, Target.of(options.output)
-    _check(ctx, options, target)
+    writing, general, inputs, output = options.writing, options.writing.general, options.inputs, options.output
+    form = form_of(output)
+    if not any(is_set(ctx, name) for name in GOALS):
+        raise click.UsageError("say how many splats to keep: give one of --to, --max-bytes and --psnr")
+    if form.suffix not in WRITABLE:
+        raise click.UsageError(f"--output writes {', '.join(WRITABLE)}, not {form.suffix}")
+    if DASH in inputs and len(inputs) > 1:
+        raise click.UsageError("standard input cannot be merged with files; save it to a file first")
+    check_outputs(ctx, form, [output], WRITABLE, count=len(inputs))
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.bake_jobs import bake_files, merged_source
-        from ..bake.settings import Baked
         from ..bake.simplifying import SimplifyGoal
 
         steps = options.refine
-        settings = bake_settings(
+        settings = writing.settings(
             ctx,
-            target.form,
-            options.scene,
-            options.written,
-            options.cluster_sh,
+            form,
             method=QUALITY,
             growth=DETAIL_GROWTH,
-            max_sh=options.max_sh,
             simplify=SimplifyGoal(options.to, options.max_bytes, options.psnr),
             refine=None if steps is None else FitSettings(steps or None, options.seed, device=options.device),
             camera_path=options.camera_path,
@@ -148,7 +135,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
             console.say(question)
         console.announce_compiling(settings)
         source = inputs[0] if len(inputs) == 1 else merged_source(inputs)
-        (baked,) = bake_files(
+        (outcome,) = bake_files(
             [(source, output)],
             settings,
             overwrite=options.overwrite,
@@ -158,26 +145,8 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
             job=console.job,
             say=console.say,
         )
-        if isinstance(baked, SparklodError):
+        if isinstance(outcome, SparklodError):
             # Errors about one of several inputs name it already.
             with naming(name_of(source), FormatError) if len(inputs) == 1 else contextlib.nullcontext():
-                raise baked
-        assert isinstance(baked, Baked)
-        report_baked(console, source, shown(output), baked)
-        if options.as_json:
-            print_json(record_of(source, output, baked))
-        exit_if_interrupted(ctx, console)
-
-
-def _check(ctx: click.Context, options: SimplifyOptions, target: Target) -> None:
-    """Raise a `click.UsageError` where options contradict each other, or the names of options."""
-    if not flags_set(ctx, GOALS):
-        raise click.UsageError("say how many splats to keep: give one of --to, --max-bytes and --psnr")
-    target.check_name("--output", WRITABLE)
-    if target.form.suffix not in WRITABLE:
-        raise click.UsageError(f"--output writes {', '.join(WRITABLE)}, not {target.form.suffix}")
-    if DASH in options.inputs and len(options.inputs) > 1:
-        raise click.UsageError("standard input cannot be merged with files; save it to a file first")
-    check(ctx, count=len(options.inputs), format=target.form.name)
-    keep_apart(ctx, {"output": target.files([options.output])})
-    claim_stdout(ctx, "output", as_json=options.as_json, binary=True)
+                raise outcome
+        report(ctx, console, source, output, outcome, as_json=writing.as_json)

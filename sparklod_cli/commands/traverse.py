@@ -21,7 +21,7 @@ from ..viewers.viewer_settings import StreamingSettings
 from .command import COMMON, Command, flag, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
 from .option_groups import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, parse_asserts, report_outcomes, table_output
-from .outputs import NamedPath, claim_stdout, keep_apart, name_outputs
+from .outputs import NamedPath, keep_apart, name_outputs
 from .rules import check
 from .viewing_options import Cameras, CutOptions, Inputs, check_view, files_read, scenes_of
 
@@ -111,7 +111,6 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
     name_outputs(ctx, ctx.params["scene"] or next(iter(ctx.params["files"]), None))
     options = values_of(ctx, TraverseOptions)
     general = options.general
-    claim_stdout(ctx, "output", as_json=options.as_json)
     budget = options.cut.one_budget()
     instances = options.inputs.instances()
     besides = files_read(options.cameras, instances)

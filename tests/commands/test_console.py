@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.commands import console as console_module
-from sparklod_cli.commands.build_lod import CLAMPED_BY_SPZ
+from sparklod_cli.commands.build_lod import ADVICE
 from sparklod_cli.commands.console import Console, count_of, say_error
 from sparklod_cli.images.pyvista_scene import load_pyvista
 from sparklod_cli.inspection import tree
@@ -77,7 +77,7 @@ def test_clamped_values_are_one_line_and_verbose_has_details(
     _, *lines = cli("build-lod a.ply").err.splitlines()
     assert lines == [f"  {consequence} than SPZ can hold; --format rad keeps more of them"] * bool(consequence)
     err = cli("build-lod a.ply --overwrite -v").err
-    advice = CLAMPED_BY_SPZ[name, "above" in detail][1]
+    advice = ADVICE["SPZ", name]["above" in detail]
     said = re.escape(detail).replace("N", r"\d+ nodes? \(.* %\)")
     assert re.search(rf"\n  {said}, and are clamped to what SPZ holds: {re.escape(advice)}\n", err), err
     assert err.count("clamped to") == 1 and "--scale" not in err

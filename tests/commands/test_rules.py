@@ -58,6 +58,7 @@ FACTS: dict[str, list[Any]] = {
     "picture=png": ["-o", "out.png"],
     "picture=npy": ["-o", "out.npy"],
     "table=none": [],
+    "stdout=terminal": [],
     "scenes=None": [PLAIN],
     "scenes=a Level-of-Detail tree": [],
     "scenes=Streamed SOG": [FIXTURES / "golden" / "sh1-streamed-sog"],
@@ -169,14 +170,14 @@ def test_every_row_refuses_a_command_line(
     elif condition:
         line += argument(command, condition)
     if rule.when:
-        line += argument(command, rule.when[0])
-    elif condition == "table=none":
+        line = [PLAIN, "-", *line[2:]] if command == "convert" else [*line, *argument(command, rule.when[0])]
+    if condition == "stdout=terminal" or (condition == "table=none" and not rule.when):
         monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     if command == "simplify" and not {"--to", "--max-bytes", "--psnr"} & {*map(str, line)}:
         line += ["--to", "50%"]
     if condition in FACTS or fact == "format":
         line = with_needs(command, name, line, rule)
-    if command == "render" and "-o" not in line:
+    if command == "render" and not {"-o", "--output"} & {*map(str, line)}:
         line += ["-o", "out.png"]
     assert run([command, *map(str, line)]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
