@@ -1,9 +1,13 @@
-"""`Finding`, one fault of a file, and the table of all kinds of findings."""
+"""`Finding`, one fault of a file, the table of all kinds of findings, and counts of faulty splats."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..codecs import streamed_manifest, tileset
 from ..codecs.format_rules import RuleViolation
@@ -11,7 +15,7 @@ from ..codecs.rad import rad_header
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
-#: Every code, its severity and its meaning. Codes do not change from version to version.
+#: Severity and meaning of each code. Codes do not change from version to version.
 CODES: dict[str, tuple[str, str]] = {
     "file.unreadable": (ERROR, "the file cannot be opened or is empty"),
     "file.format": (ERROR, "the file has no format that sparklod reads"),
@@ -75,10 +79,13 @@ CODES: dict[str, tuple[str, str]] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One fault of a file; `code` is one of `CODES`, and `message` has the numbers, in a line.
+    """One fault of a file.
 
     Attributes:
-        index, count: the first splat or node concerned, and their number; None for the file as a whole.
+        code: one of `CODES`.
+        message: one line with the numbers of this file.
+        index: the first splat or node concerned; None for the file as a whole.
+        count: number of splats or nodes concerned; None for the file as a whole.
     """
 
     code: str
@@ -86,17 +93,13 @@ class Finding:
     index: int | None = None
     count: int | None = None
 
-    def __post_init__(self) -> None:
-        if self.code not in CODES:
-            raise ValueError(f"{self.code} is not a known code")
-
     @property
     def severity(self) -> str:
         return CODES[self.code][0]
 
 
 def findings_of(violations: Iterable[RuleViolation]) -> list[Finding]:
-    """Return a finding for each code: the text of its first violation, and the number of further ones."""
+    """Return a finding for each code: the text of its first violation and the number of the rest."""
     by_code: dict[str, list[str]] = {}
     for each in violations:
         by_code.setdefault(each.code, []).append(each.text)
@@ -104,3 +107,49 @@ def findings_of(violations: Iterable[RuleViolation]) -> list[Finding]:
         Finding(code, texts[0] + (f" (and {len(texts) - 1:,} more like it)" if len(texts) > 1 else ""))
         for code, texts in by_code.items()
     ]
+
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MaskTally:
+    """Number of splats or nodes in a mask, and the index of the first."""
+
+    count: int = 0
+    first: int = -1
+
+    def __add__(self, following: MaskTally) -> MaskTally:
+        return MaskTally(self.count + following.count, self.first if self.count else following.first)
+
+    def finding(self, code: str, text: str, rest: str = " and {:,} more") -> list[Finding]:
+        """Return a finding if the mask is not empty.
+
+        Args:
+            text: its message, in which {first} is the first index and {rest} the text about the others, if any.
+            rest: the text about the others, with their number.
+        """
+        if not self.count:
+            return []
+        others = rest.format(self.count - 1) if self.count > 1 else ""
+        return [Finding(code, text.format(first=f"{self.first:,}", rest=others), self.first, self.count)]
+
+
+#: Tallies by name; empty ones for other names.
+Tallies = defaultdict[str, MaskTally]
+
+
+def tallies(masks: Mapping[str, Mask], start: int) -> Tallies:
+    """Return the tallies of the masks of a block that begins at index `start`."""
+    counts = ((name, mask, int(np.count_nonzero(mask))) for name, mask in masks.items())
+    tallied = {name: MaskTally(count, start + int(np.argmax(mask))) for name, mask, count in counts if count}
+    return defaultdict(MaskTally, tallied)
+
+
+def merged(parts: Iterable[Mapping[str, MaskTally]]) -> Tallies:
+    """Add the tallies of all blocks, in order."""
+    total = defaultdict[str, MaskTally](MaskTally)
+    for part in parts:
+        for name, tally in part.items():
+            total[name] += tally
+    return total

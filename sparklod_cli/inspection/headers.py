@@ -1,11 +1,11 @@
-"""Facts from the headers of files in parts, RAD, Streamed SOG and 3D Tiles, and the rules that those break."""
+"""Facts from the headers of formats with several parts (RAD, Streamed SOG, 3D Tiles), and their broken rules."""
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +14,7 @@ from ..codecs import tileset as tilesets
 from ..codecs.format_rules import RuleViolation
 from ..codecs.merging import Chunk
 from ..codecs.rad.property_codings import BY_NAME, CODINGS, LARGEST_F16
-from ..codecs.rad.rad_header import RadChunkHeader, RadHeader, encoding_fields
+from ..codecs.rad.rad_header import RadChunkHeader, encoding_fields
 from ..codecs.rad.rad_reader import RadReader, scan_header
 from ..codecs.reader import OpenCompanion, size_of
 from ..codecs.spark_codings import log_scale_table
@@ -27,21 +27,7 @@ from ..model.scene import common_axis
 from ..model.transforms import EarthPlace, place_of
 from ..system.progress import Progress, silent
 from ..system.untrusted import LARGEST, MOST, printable
-from .findings import Finding, findings_of
 from .values import Box, Ends
-
-
-@dataclass(frozen=True)
-class Head:
-    """First fields of a report, known before any splat is read: `bytes` are those of all files together."""
-
-    format: str
-    bytes: int
-    splats: int
-    sh_degree: int
-    antialiased: bool
-    up: str | None
-    up_by: str = ""
 
 
 @dataclass(frozen=True)
@@ -54,7 +40,7 @@ class ChunkBytes:
 
     @classmethod
     def of(cls, sizes: Sequence[int]) -> ChunkBytes | None:
-        """Return the least, median and greatest of the sizes of chunks; None without any."""
+        """Return the smallest, median and largest size; None without chunks."""
         return cls(min(sizes), round(statistics.median(sizes)), max(sizes)) if sizes else None
 
 
@@ -63,7 +49,7 @@ QUANTILES = {"min": 0.0, "p25": 0.25, "p50": 0.5, "p75": 0.75, "max": 1.0}
 
 
 def quantiles_of(values: ArrayLike, weights: ArrayLike | None = None) -> dict[str, float]:
-    """Return the quantiles of one or more values, each of them one of these, and their mean; weights are not all 0."""
+    """Return the quantiles, without interpolation, and the mean of one or more values; not all weights may be 0."""
     numbers = np.asarray(values, np.float64)
     order = np.argsort(numbers, kind="stable")
     weighed = np.ones(len(numbers)) if weights is None else np.asarray(weights, np.float64)
@@ -78,34 +64,21 @@ def _line(text: object) -> str | None:
     return printable(" ".join(text.split()), MOST) if isinstance(text, str) else None
 
 
-@dataclass(frozen=True)
-class HeaderScan:
-    """Facts and broken rules from the headers of a file and of the files that it names.
+class HeaderScan(NamedTuple):
+    """Rules broken by the headers of a file and of the files that it names, and what they say of the file.
 
     Attributes:
-        field: of the report that has the facts, "rad", "streamed_sog" or "tiles".
-        facts: `RadFacts`, `StreamedSogFacts` or `TileFacts`; None, as `head`, if a fatal rule is broken.
+        fields: of the `Report`: "rad", "streamed_sog" or "tiles", "format", "bytes" of all files together, "splats",
+            "sh_degree", "antialiased", "up", "up_by"; None if a fatal rule is broken.
     """
 
-    field: str
     violations: Sequence[RuleViolation]
-    head: Head | None = None
-    facts: Any = None
-
-    @property
-    def findings(self) -> list[Finding]:
-        """Broken rules, one finding for each code."""
-        return findings_of(self.violations)
-
-    @property
-    def fatal(self) -> list[Finding]:
-        """Findings because of which the file cannot be read."""
-        return findings_of(each for each in self.violations if each.fatal)
+    fields: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
 class PropertyFacts:
-    """A property of all chunks, see `schema.json`."""
+    """Storage of a property in all chunks, see `schema.json`."""
 
     encoding: str
     bytes: int
@@ -116,7 +89,7 @@ class PropertyFacts:
 
 @dataclass(frozen=True)
 class RadFacts:
-    """Facts from the headers of a RAD file; `schema.json` describes the fields."""
+    """Facts from the headers of a RAD file, see `schema.json`."""
 
     chunked: bool
     bytes: int
@@ -131,7 +104,7 @@ class RadFacts:
 
 
 def survey_rad(file: BinaryIO, open_companion: OpenCompanion, *, check: bool) -> HeaderScan:
-    """Read the headers of a RAD file and of its chunks, and to `check` them the padding of properties."""
+    """Read the headers of a RAD file and of its chunks; `check` reads the padding of properties, too."""
     header, violations = scan_header(file, open_companion)
     chunks: list[RadChunkHeader] = []
     if not any(each.fatal for each in violations):
@@ -139,13 +112,7 @@ def survey_rad(file: BinaryIO, open_companion: OpenCompanion, *, check: bool) ->
             violations += broken
             chunks += [] if chunk is None else [chunk]
     if any(each.fatal for each in violations):
-        return HeaderScan("rad", violations)
-    facts, noted = _rad_facts(header, chunks), header.noted
-    head = Head(header.format, facts.bytes, header.count, header.max_sh, noted.antialiased, noted.up)
-    return HeaderScan("rad", violations, head, facts)
-
-
-def _rad_facts(header: RadHeader, chunks: Sequence[RadChunkHeader]) -> RadFacts:
+        return HeaderScan(violations)
     sizes = [entry.bytes for entry in header.chunks]
     total = header.bytes + sum(sizes)
     properties = {}
@@ -161,7 +128,7 @@ def _rad_facts(header: RadHeader, chunks: Sequence[RadChunkHeader]) -> RadFacts:
                 min=min((each.min for each in found if each.min is not None), default=None),
                 max=max((each.max for each in found if each.max is not None), default=None),
             )
-    return RadFacts(
+    facts = RadFacts(
         chunked=header.chunked,
         bytes=total,
         header_bytes=header.bytes,
@@ -173,10 +140,13 @@ def _rad_facts(header: RadHeader, chunks: Sequence[RadChunkHeader]) -> RadFacts:
         comment=_line(header.comment),
         properties=properties,
     )
+    fields = {"format": header.format, "bytes": total, "splats": header.count, "sh_degree": header.max_sh}
+    fields |= {"antialiased": header.noted.antialiased, "up": header.noted.up}
+    return HeaderScan(violations, fields | {"rad": facts})
 
 
 def ends_of_rad(facts: RadFacts) -> Ends:
-    """Return the ends of the codes of a file; none if chunks have several encodings."""
+    """Return the limits of the codes of a file; infinite if chunks have several encodings."""
     center, scales = facts.properties.get("center"), facts.properties.get("scales")
     ends = Ends()
     if center is not None and center.encoding in ("f16", "f16_lebytes"):
@@ -189,7 +159,7 @@ def ends_of_rad(facts: RadFacts) -> Ends:
 
 @dataclass(frozen=True)
 class LevelFacts:
-    """A detail level, see `schema.json`."""
+    """Size of a detail level, see `schema.json`."""
 
     splats: int
     share: float | None
@@ -201,7 +171,7 @@ class LevelFacts:
 
 @dataclass(frozen=True)
 class EnvironmentFacts:
-    """The splats that are drawn at all detail levels, and the bytes of their files."""
+    """Size of the splats that are drawn at all detail levels, and of their files."""
 
     splats: int
     bytes: int
@@ -230,25 +200,30 @@ class StreamedSogFacts:
 def survey_streamed_sog(
     file: BinaryIO, open_companion: OpenCompanion, *, check: bool, threads: int = 1, progress: Progress = silent
 ) -> HeaderScan:
-    """Read a manifest and the headers of its chunk files, and to `check` them their splats."""
+    """Read a manifest and the headers of its chunk files; `check` reads their splats, too."""
     size = size_of(file)
     manifest, files, violations = scan_files(file, open_companion)
     if any(each.fatal for each in violations):
-        return HeaderScan("streamed_sog", violations)
+        return HeaderScan(violations)
     chunks = {name: chunk for name, chunk in files.items() if isinstance(chunk, Chunk)}
     if check:
         violations += scan_splats(open_companion, manifest, chunks, threads=threads, progress=progress)
     layout = layout_of(manifest)
     facts = _detail_facts(layout, chunks, size)
-    # What a reader of level 0 and the environment finds.
+    # A reader of the file reads level 0 and the environment.
     read, count = _chunks_of(layout, chunks, 0), facts.levels[0].splats
     if manifest.environment is not None:
         read.append(chunks[manifest.environment])
         count += chunks[manifest.environment].count
+    fields = {"format": f"Streamed SOG {STREAMED_SOG_VERSION}", "bytes": facts.bytes, "splats": count}
+    fields |= _kind_of(read) | {"up": manifest.noted.up, "streamed_sog": facts}
+    return HeaderScan(violations, fields)
+
+
+def _kind_of(read: Sequence[Chunk]) -> dict[str, Any]:
+    """Return the SH degree and the antialiasing of chunks that are read together."""
     degree = max((chunk.sh_degree for chunk in read), default=0)
-    antialiased = any(chunk.antialiased for chunk in read)
-    head = Head(f"Streamed SOG {STREAMED_SOG_VERSION}", facts.bytes, count, degree, antialiased, manifest.noted.up)
-    return HeaderScan("streamed_sog", violations, head, facts)
+    return {"sh_degree": degree, "antialiased": any(chunk.antialiased for chunk in read)}
 
 
 def _chunks_of(layout: RegionLayout, chunks: Mapping[str, Chunk], level: int) -> list[Chunk]:
@@ -307,17 +282,17 @@ def _detail_level(layout: RegionLayout, chunks: Mapping[str, Chunk], level: int)
 
 
 def _edge(low: float, high: float) -> float:
-    """Return the length between two numbers, which are finite but may be as large as numbers are."""
+    """Return the difference of two finite numbers, without an overflow."""
     return min(max(high - low, -LARGEST), LARGEST)
 
 
-#: Distance from the centre of the Earth, metres, from which on a transform places a tileset on it. Chosen.
+#: Distance of an origin from the centre of the Earth, metres, from which on a tileset lies on the Earth. Chosen.
 ON_EARTH = 1e6
 
 
 @dataclass(frozen=True)
 class TileLevelFacts:
-    """The tiles of a depth, see `schema.json`."""
+    """Size of the tiles of one depth, see `schema.json`."""
 
     tiles: int
     splats: int
@@ -348,34 +323,36 @@ class TileFacts:
 def survey_tiles(
     file: BinaryIO, open_companion: OpenCompanion, *, check: bool, threads: int = 1, progress: Progress = silent
 ) -> HeaderScan:
-    """Read a tileset and the headers of its tiles, and to `check` them their splats."""
+    """Read a tileset and the headers of its tiles; `check` reads their splats, too."""
     tileset = read_whole(file.read(MAX_TILESET + 1), open_companion)
     found = list(tilesets.read_violations(tileset))
     if not found:
         found += tilesets.violations(tileset)
     if any(each.fatal for each in found):
-        return HeaderScan("tiles", found)
+        return HeaderScan(found)
     matrices = tilesets.matrices_of(tileset)
     named = {name: matrices[at] for at, tile in enumerate(tileset.tiles) if (name := tile.name) is not None}
     files = tile_files(open_companion, named)
     chunks, about_files = tilesets.scan_files(tileset, files)
     found += about_files
     if any(each.fatal for each in found):
-        return HeaderScan("tiles", found)
+        return HeaderScan(found)
     if check:
         found += tilesets.scan_splats(tileset, files, chunks, threads=threads, progress=progress)
-    # What a reader of the tiles without children finds.
-    read = [chunk for number, chunk in chunks.items() if not tileset.tiles[number].children]
-    head = Head(
-        f"3D Tiles {tileset.head['asset']['version']} of {read[0].format}" if read else "3D Tiles",
-        tileset.bytes + sum(chunk.bytes for chunk in chunks.values()),
-        sum(chunk.count for chunk in read),
-        max((chunk.sh_degree for chunk in read), default=0),
-        any(chunk.antialiased for chunk in read),
-        common_axis(chunk.up for chunk in read),
-        common_axis(chunk.up_by for chunk in read) or "",
+    # A reader of the file reads the tiles without children.
+    read, facts = (
+        [chunk for at, chunk in chunks.items() if not tileset.tiles[at].children],
+        _tile_facts(tileset, chunks),
     )
-    return HeaderScan("tiles", found, head, _tile_facts(tileset, chunks))
+    fields = {
+        "format": f"3D Tiles {facts.version} of {read[0].format}" if read else "3D Tiles",
+        "bytes": facts.bytes,
+        "splats": sum(chunk.count for chunk in read),
+        "up": common_axis(chunk.up for chunk in read),
+        "up_by": common_axis(chunk.up_by for chunk in read) or "",
+        "tiles": facts,
+    }
+    return HeaderScan(found, fields | _kind_of(read))
 
 
 def _tile_facts(tileset: Tileset, chunks: Mapping[int, Chunk]) -> TileFacts:
@@ -417,7 +394,7 @@ def _tile_level(tileset: Tileset, chunks: Mapping[int, Chunk], numbers: Sequence
 
 
 def _place(tileset: Tileset) -> EarthPlace | None:
-    """Return where the transform of the root puts the origin of the scene; None where that is not on the Earth."""
+    """Return the place on the Earth to which the root's transform moves the origin; None if it is not on the Earth."""
     matrix = tilesets.matrix_of(tileset.tiles[0].record)
     if float(np.linalg.norm(matrix[:3, 3])) < ON_EARTH:
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -29,18 +29,18 @@ from ..system.untrusted import QUOTED, near, printable, quoted
 from ..tables.assertions import Assertion, BadAssertionError, is_number, number_text, parse_assertion
 from ..tables.columns import Row
 from . import headers, tree, values
-from .blocks import Block, ReportBlocks, chunk_row, chunk_table, merged
-from .findings import Finding
-from .headers import Head, HeaderScan
+from .blocks import Block, ReportBlocks, chunk_row, chunk_table
+from .findings import Finding, findings_of, merged
+from .headers import HeaderScan
 
 #: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
 SCHEMA_VERSION = 1
 
-#: Columns of `Splats` that a report without statistics, findings and chunks is computed from, those that all others
-#: need of a file whose codes cannot be invalid, and what --stats needs besides.
+#: Columns of `Splats` needed by all reports on a tree, by reports with statistics, findings or chunks on a file whose
+#: codes cannot be invalid, and, additionally, by --stats.
 OF_TREE, OF_VALUES, OF_STATISTICS = {"scale", "opacity"}, {"center", "scale", "opacity"}, {"rgb", "sh"}
 
-#: Fields for which the headers of a RAD file, or of the files of a Streamed SOG or 3D Tiles, are enough.
+#: Fields that headers alone provide, for RAD, Streamed SOG and 3D Tiles.
 HEADER_FIELDS = (
     *("file", "bytes", "format", "splats", "sh_degree", "bytes_per_splat", "compression_ratio", "rad", "streamed_sog"),
     "tiles",
@@ -56,10 +56,10 @@ class ReportSettings:
     """Contents of a report besides the header and the tree.
 
     Attributes:
-        all_quantities: all of their quantities, instead of the main ones.
-        headers_only: read no more than headers where a format has those; tree and values are left out.
-        at_once: have the whole scene in memory, with all columns, for callers that draw it; False reads RAD files chunk
-            by chunk; None does so with large ones, see `rad_reader.fits`.
+        all_quantities: with `values`, all of their quantities, instead of the main ones.
+        headers_only: of formats with several parts, read headers only; tree and values are left out.
+        at_once: read the whole scene, with all columns, so that it can be drawn; False reads RAD files chunk by chunk;
+            None does so with large ones, see `rad_reader.fits`.
     """
 
     chunks: bool = False
@@ -74,26 +74,8 @@ class ReportSettings:
 class Report:
     """The report on a file. `--json` prints `as_dict`, which `schema.json` describes.
 
-    Attributes:
-        file: path, as it was given.
-        bytes: size on disk; of a file that names others, that of all files together.
-        format: name for display; None if the file could not be read.
-        splats: number of splats, or nodes of a tree.
-        sh_degree, antialiased: of the splats.
-        up: the axis that points up: "y", "-z"; None where it is unknown.
-        up_by: the format whose specification says so; empty if the file itself does, or if unknown.
-        header: fields of the header, which depend on the format.
-        bytes_per_splat: size over splats.
-        compression_ratio: size of the decoded splats, as 4-byte floats, over that of the file.
-        notes: data that the reader left out.
-        hints: settings of viewers that suit the file; none unless it was checked.
-        rad: facts from the headers of a RAD file; None for other formats.
-        streamed_sog: facts from the manifest of a Streamed SOG; None for other formats.
-        tiles: facts from the tilesets and headers of 3D Tiles; None for other formats.
-        tree: facts of the Level-of-Detail tree; None without one.
-        values: statistics of the splats; None if not requested.
-        chunks: a row for each chunk, see `blocks.CHUNK_COLUMNS`; None if not requested.
-        findings: None if not requested, unless the file could not be read.
+    Fields that were not requested, or that its format does not have, are None; so are all but `file`, `bytes` and
+    `findings` of a file that could not be read.
     """
 
     file: str
@@ -118,11 +100,11 @@ class Report:
     findings: list[Finding] | None = None
 
     def fails(self, severity: str) -> bool:
-        """Whether it has a finding of this severity, or an error."""
+        """Return whether there is an error or a finding of this severity."""
         return any(found.severity in ("error", severity) for found in self.findings or [])
 
     def value_at(self, name: str) -> Any:
-        """Return the value of a field, see `value_at`."""
+        """Return the value of a field by its name, see the function `value_at`."""
         return value_at(self.as_dict(), name)
 
     def as_dict(self) -> dict[str, Any]:
@@ -133,7 +115,7 @@ class Report:
 
 
 def value_at(plain: dict[str, Any], name: str) -> Any:
-    """Return the value of a field of a report as JSON: keys and indices with dots between ("tree.levels.0.nodes")."""
+    """Return the value of a field of a JSON report by its name, such as "tree.levels.0.nodes"."""
     value: Any = plain
     try:
         for key in name.split("."):
@@ -146,46 +128,46 @@ def value_at(plain: dict[str, Any], name: str) -> Any:
 def inspect(
     path: Path, settings: ReportSettings, *, threads: int = 1, progress: Progress = silent
 ) -> tuple[Report, Scene | None]:
-    """Return the report on a file, or on the folder of an unpacked SOG, and its scene if it was read.
+    """Report on a file, or on the folder of an unpacked SOG; also return its scene.
 
-    A file that cannot be read gives a finding, not an error, and None for the scene. Unless the scene is wanted as a
-    whole (`ReportSettings.at_once`), it is None of RAD files that are read chunk by chunk and of SPZ files.
+    A file that cannot be read gives a finding, not an error. The scene is None then, and without
+    `ReportSettings.at_once` also for RAD files that are read chunk by chunk and for SPZ files.
     """
     columns = set(COLUMNS) if settings.values or settings.check or settings.chunks else OF_TREE
     size, unread, surveyed = size_of_input(path), set[str](), None
     try:
         held = read_arrays(path)
         if held is not None:
-            fields, scene_of_arrays = _of_arrays(held, settings, threads=threads)
-            each = round(size / fields["splats"], 3) if size and fields["splats"] else None
-            return Report(str(path), size, bytes_per_splat=each, **fields), scene_of_arrays
+            return _of_arrays(path, held, settings, size, threads)
         surveyed = _surveyed(path, settings.check, threads, progress)
-        if surveyed is not None and surveyed.facts is None:
-            return Report(str(path), size, findings=surveyed.findings if settings.check else surveyed.fatal), None
-        if surveyed is not None and settings.headers_only:
-            return _report(path, surveyed.head, surveyed), None
-        if surveyed is not None and surveyed.field == "rad" and settings.at_once is not True:
+        fields = None if surveyed is None else surveyed.fields
+        if surveyed is not None and fields is None:
+            broken = [each for each in surveyed.violations if settings.check or each.fatal]
+            return Report(str(path), size, findings=findings_of(broken)), None
+        if fields is not None and settings.headers_only:
+            return _report(path, fields), None
+        if fields is not None and "rad" in fields and settings.at_once is not True:
             with opened(path) as (source, _):
                 rad = RadReader.open(source.file, source.open_companion)
             if settings.at_once is False or not fits(rad.header):
                 blocks = ReportBlocks.of_file(path, rad, threads=threads, progress=progress)
-                return _of_blocks(path, blocks, columns, size, settings, surveyed, threads), None
+                return report_on(path, blocks, settings, columns, size, surveyed, threads), None
         if surveyed is None and settings.at_once is not True and not settings.check:
             # Only SPZ files are read by columns. None of their codes is invalid but positions of version 1.
             needed = OF_VALUES | (OF_STATISTICS if settings.values and settings.all_quantities else set())
             unread, columns = columns - needed, columns & needed
         scene = read_scene(path, columns=columns, threads=threads, progress=progress, validate=False)
     except FormatError as error:
-        found = surveyed.findings if surveyed is not None and settings.check else []
+        found = findings_of(surveyed.violations) if surveyed is not None and settings.check else []
         known = any(each.code == error.code for each in found)
         return Report(str(path), size, findings=[*found, *([] if known else [Finding(error.code, str(error))])]), None
     partial = surveyed is None and settings.at_once is not True and "fractional_bits" in scene.header
     blocks = ReportBlocks.of(scene, unread if partial else ())
-    return _of_blocks(path, blocks, columns, size, settings, surveyed, threads), None if partial else scene
+    return report_on(path, blocks, settings, columns, size, surveyed, threads), None if partial else scene
 
 
 def _surveyed(path: Path, check: bool, threads: int, progress: Progress) -> HeaderScan | None:
-    """Return facts and findings from the headers of a file; None for formats of one part."""
+    """Scan the headers of a file; None for formats of one part."""
     with opened(path) as (source, form):
         if form.name != RAD and form.parts is None:
             return None
@@ -196,25 +178,26 @@ def _surveyed(path: Path, check: bool, threads: int, progress: Progress) -> Head
         return survey(source.file, source.open_companion, check=check, threads=threads, progress=progress)
 
 
-def _of_blocks(
+def report_on(
     path: Path,
     blocks: ReportBlocks,
-    columns: Collection[str],
-    size: int | None,
     settings: ReportSettings,
-    surveyed: HeaderScan | None,
-    threads: int,
+    columns: Collection[str] = COLUMNS,
+    size: int | None = None,
+    surveyed: HeaderScan | None = None,
+    threads: int = 1,
 ) -> Report:
+    """Report on the splats of a file of `size` bytes, reading these columns of all blocks."""
     about = blocks.about
-    degree = about.splats.sh_degree
-    ends, size = values.ends_of(about.header), about.header.get("bytes", size)
-    findings = _container_findings(about)
+    ends, findings = values.ends_of(about.header), _container_findings(about)
+    fields: dict[str, Any] = {"bytes": about.header.get("bytes", size)}
     if surveyed is not None:
-        of_files = {each.code for each in surveyed.findings}  # which say in which file
-        findings = [each for each in findings if each.code not in of_files] + surveyed.findings
-        size = surveyed.facts.bytes
-    if surveyed is not None and surveyed.field == "rad":
-        ends = headers.ends_of_rad(surveyed.facts)
+        assert surveyed.fields is not None
+        broken, fields = findings_of(surveyed.violations), dict(surveyed.fields)
+        findings = [each for each in findings if each.code not in {other.code for other in broken}] + broken
+    in_chunks = "rad" in fields
+    if in_chunks:
+        ends = headers.ends_of_rad(fields["rad"])
     nodes = tree.TreeColumns.of(blocks) if blocks.is_tree and blocks.count else None
 
     def examined(block: Block) -> tuple[Any, Any, Any]:
@@ -225,53 +208,44 @@ def _of_blocks(
         )
 
     opaque, tallies, rows = zip(*blocks.map(examined, columns, threads), strict=True) if blocks.count else ((), (), ())
-    statistics = facts = table = None
-    hints: list[str] = []
-    if settings.values:
-        total = values.ValueTally.total(tallies)
-        statistics = values.statistics_of(blocks, total, all_quantities=settings.all_quantities, threads=threads)
+    found: dict[str, Any] = {}
     if settings.chunks:
-        table = chunk_table(rows, about.chunk_bytes, None if nodes is None else (nodes.tree, nodes.size))
+        found["chunks"] = chunk_table(rows, about.chunk_bytes, None if nodes is None else (nodes.tree, nodes.size))
     if nodes is not None:
-        facts, found = tree.examine_blocks(
+        found["tree"], of_tree = tree.examine(
             blocks,
             nodes,
             merged(opaque),
             check=settings.check,
             scale_ends=ends.scale,
-            in_chunks=surveyed is not None and surveyed.field == "rad",
+            in_chunks=in_chunks,
             threads=threads,
         )
-        findings += found
-    if settings.check:
+        findings += of_tree
+    if settings.values or settings.check:
         total = values.ValueTally.total(tallies)
-        findings += values.findings_about(total, ends, is_tree=blocks.is_tree)
-        hints = values.hints_about(total.layouts, degree)
-    head = Head(about.format, size or 0, blocks.count, degree, about.antialiased, about.up, about.up_by)
-    report = _report(path, head, surveyed)
-    return dataclasses.replace(
-        report,
-        bytes=size,
-        header=dict(about.header),
-        notes=list(about.notes),
-        hints=hints,
-        tree=facts,
-        values=statistics,
-        chunks=table,
-        findings=findings if settings.check else None,
-    )
+    if settings.values:
+        quantities = settings.all_quantities
+        found["values"] = values.statistics_of(blocks, total, all_quantities=quantities, threads=threads)
+    if settings.check:
+        merged_splats = blocks.is_tree or NO_CHILDREN in about.notes
+        found["findings"] = findings + values.findings_about(total.by_name, ends, merged_splats=merged_splats)
+        found["hints"] = values.hints_about(total.layouts, about.splats.sh_degree)
+    fields |= {"format": about.format, "splats": blocks.count, "sh_degree": about.splats.sh_degree}
+    fields |= {"antialiased": about.antialiased, "up": about.up, "up_by": about.up_by}
+    fields |= {"header": dict(about.header), "notes": list(about.notes)}
+    return _report(path, fields | found)
 
 
-def _report(path: Path, head: Head | None, surveyed: HeaderScan | None) -> Report:
-    assert head is not None
-    size, count = head.bytes, head.splats
-    decoded = 4 * count * width_of(head.sh_degree)
+def _report(path: Path, fields: Mapping[str, Any]) -> Report:
+    """Return a report with these fields and with the size of the file relative to its splats."""
+    size, count = fields["bytes"], fields["splats"]
+    decoded = 4 * count * width_of(fields["sh_degree"])
     return Report(
         str(path),
-        **dataclasses.asdict(head),
+        **fields,
         bytes_per_splat=round(size / count, 3) if size and count else None,
         compression_ratio=round(decoded / size, 3) if size else None,
-        **({} if surveyed is None else {surveyed.field: surveyed.facts}),
     )
 
 
@@ -295,54 +269,46 @@ NO_CHILDREN = "its splats are the nodes of a tree, but it has no child indices, 
 
 
 def _of_arrays(
-    arrays: layouts.Arrays, settings: ReportSettings, *, threads: int = 1
-) -> tuple[dict[str, Any], Scene | None]:
-    """Return the fields of a report on the arrays of one of `codecs.formats.ENCODINGS`, and the splats if complete."""
-    fields: dict[str, Any] = {"sh_degree": 0, "antialiased": False, "findings": []}
-    scene: Scene | None = None
-    if "packed" in arrays or "ext0" in arrays:
-        if "packed" in arrays:
-            # build-lod writes trees, for which Spark stores LoD opacities; the file does not record that.
-            splats = layouts.unpack_packed(arrays, SplatEncoding(lod_opacity=True), threads=threads)
-            scene = Scene(splats, format="NPZ of PackedSplats")
-        else:
-            splats = layouts.unpack_ext(arrays, threads=threads)
-            scene = Scene(splats, format="NPZ of ExtSplats")
-        form, count, note, fields["sh_degree"] = scene.format, len(splats), NO_CHILDREN, splats.sh_degree
-        if settings.values:
-            fields["values"] = values.examine(splats, all_quantities=settings.all_quantities)
-        if settings.check:  # merged splats have opacities above 1
-            opaque = dataclasses.replace(splats, opacity=np.minimum(splats.opacity, np.float32(1)))
-            fields["findings"] = values.check(Scene(opaque))
+    path: Path, arrays: layouts.Arrays, settings: ReportSettings, size: int | None, threads: int
+) -> tuple[Report, Scene | None]:
+    """Report on the arrays of one of `codecs.formats.ENCODINGS`; also return the splats if they are complete."""
+    settings = dataclasses.replace(settings, chunks=False)
+    if "packed" in arrays:
+        # build-lod writes trees, for which Spark stores LoD opacities; the file does not record that.
+        splats = layouts.unpack_packed(arrays, SplatEncoding(lod_opacity=True), threads=threads)
+        scene = Scene(splats, format="NPZ of PackedSplats", notes=(NO_CHILDREN,))
+    elif "ext0" in arrays:
+        scene = Scene(layouts.unpack_ext(arrays, threads=threads), format="NPZ of ExtSplats", notes=(NO_CHILDREN,))
     elif "lod_tree" in arrays:
         nodes = layouts.unpack_nodes(arrays)
-        form, count = "NPZ of LodTree", len(nodes.tree)
+        # Opaque balls of the sizes of the nodes, whose scales and opacities are not stored.
+        balls = Splats.zeros(len(nodes.tree), 0)
+        balls.scale[:], balls.opacity[:], balls.quat_xyzw[:, 3] = nodes.size[:, None] / 2, 1, 1
         note = "it has centres, sizes and children of nodes, but no opacities, colours and shapes"
-        if count:
-            # Opaque balls of the sizes of the nodes, whose scales and opacities are not stored.
-            balls = Splats.zeros(count, 0)
-            balls.scale[:] = nodes.size[:, None] / 2
-            balls.opacity[:] = 1
-            facts, fields["findings"] = tree.examine(balls, nodes.tree, check=settings.check)
-            fields["tree"] = dataclasses.replace(facts, more_than_opaque=None)
-        else:
-            fields["findings"] = [Finding("values.empty", "there are no splats")]
+        scene = Scene(balls, nodes.tree, format="NPZ of LodTree", notes=(note,))
+        settings = dataclasses.replace(settings, values=False)
     elif "texture" in arrays:
         capacity = layouts.texture_capacity(arrays)
         used = np.flatnonzero(np.ascontiguousarray(arrays["texture"]).reshape(capacity, 8).any(axis=1))
-        form, count = "NPZ of a data texture", int(used[-1]) + 1 if len(used) else 0
         note = "it has centres, covariances and colours of nodes, but no opacities above 1, SH and children"
+        fields = {"bytes": size, "splats": int(used[-1]) + 1 if len(used) else 0, "sh_degree": 0, "antialiased": False}
+        report = _report(path, fields | {"format": "NPZ of a data texture", "notes": [note]})
+        return dataclasses.replace(report, compression_ratio=None, findings=[] if settings.check else None), None
     else:
         raise FormatError(f"its arrays ({', '.join(arrays)}) match no layout that convert writes")
-    fields |= {"format": form, "splats": count, "notes": [note]}
-    return fields | ({} if settings.check else {"findings": None}), scene
+    report = report_on(path, ReportBlocks.of(scene), settings, size=size, threads=threads)
+    kept = "values." if report.tree is None else "tree."
+    findings = None if report.findings is None else [each for each in report.findings if each.code.startswith(kept)]
+    facts = None if report.tree is None else dataclasses.replace(report.tree, more_than_opaque=None)
+    report = dataclasses.replace(report, compression_ratio=None, hints=[], tree=facts, findings=findings)
+    return report, scene if scene.tree is None else None
 
 
 class ExpectationError(SparklodError):
-    """A file of expectations cannot be understood."""
+    """A file of expectations holds something else than assertions about reports."""
 
 
-#: Short names for values of a report, besides its fields.
+#: Short names for values of a report, in addition to its fields.
 SHORT_NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "nodes": lambda report: report["splats"],
     "leaves": lambda report: report["tree"]["leaves"] if report["tree"] else report["splats"],
@@ -359,12 +325,12 @@ SHORT_NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "tiles": lambda report: report["tiles"]["tiles"],
 }
 
-#: Formats that have the names which are not about a tree.
+#: Formats to which short names apply that are not about a tree.
 NAMED_FORMATS = dict.fromkeys(("chunk_bytes", "first_bytes"), "RAD, Streamed SOG or 3D Tiles")
 NAMED_FORMATS["tiles"] = "3D Tiles"
 NAMED_FORMATS |= dict.fromkeys(("chunked", "palette"), "RAD") | dict.fromkeys(("levels", "regions"), "Streamed SOG")
 
-#: Codes of findings by name; all other names have expect.value.
+#: Codes of findings about some names; those about all other names are expect.value.
 EXPECTATION_CODES = {
     "bytes": "expect.bytes",
     "leaves": "expect.splats",
@@ -373,7 +339,7 @@ EXPECTATION_CODES = {
     "growth": "expect.growth",
 }
 
-#: Beginnings of the lines that replace the keys of files of expectations in TOML and JSON, which are no longer read.
+#: Keys of expectations in TOML and JSON, which are no longer read, and the assertions that replace them.
 REPLACED_KEYS = {
     "max_bytes": "bytes<=",
     "min_splats": "leaves>=",
@@ -386,7 +352,7 @@ OLD_KEY = re.compile(rf"""(?<![.\w])({"|".join(REPLACED_KEYS)})["']?\s*[=:]\s*([
 
 
 def parse_expectation(text: str) -> Assertion:
-    """Return an assertion about a report; `BadAssertionError` if it names nothing that a report has."""
+    """Parse an assertion about a report; raise `BadAssertionError` if no report has a value of its name."""
     assertion = parse_assertion(text, example="nodes<=5M")
     known = [*SHORT_NAMES, *(each.name for each in fields(Report))]
     if assertion.name.partition(".")[0] not in known:
@@ -396,10 +362,10 @@ def parse_expectation(text: str) -> Assertion:
 
 
 def read_expectations(path: Path) -> list[Assertion]:
-    """Return the assertions in a text file, one a line; blank lines and lines that begin with # are left out.
+    """Read assertions from a text file, one a line; blank lines and lines that begin with # are skipped.
 
     Raises:
-        ExpectationError: a line is not an assertion about a report; for a file in TOML or JSON, with its new lines.
+        ExpectationError: a line is not an assertion about a report; for TOML or JSON, it suggests the assertions.
     """
     text = read_text(path)
     found = []
@@ -420,7 +386,7 @@ def read_expectations(path: Path) -> list[Assertion]:
 
 
 def check_expectations(report: Report, expected: Sequence[Assertion]) -> list[Finding]:
-    """Return findings for the assertions that do not hold; none for a file that could not be read."""
+    """Return a finding for each assertion that does not hold; none for a file that could not be read."""
     if report.format is None:
         return []
     plain = report.as_dict()

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,11 +24,10 @@ from ..lod.kernels.tree_links import (
 )
 from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
-from ..model.scene import Scene
-from ..model.splats import FloatArray, Splats
+from ..model.splats import FloatArray
 from ..system.threads import blocks_of, ordered_map
-from .blocks import Block, Mask, MaskTally, ReportBlocks, largest, merged, tallies
-from .findings import Finding
+from .blocks import Block, ReportBlocks, largest
+from .findings import Finding, Mask, MaskTally, Tallies, merged, tallies
 
 #: Smallest feature size of a node over the mean of its children's, weighted by area. A merged splat has at least their
 #: variance, so nodes of a good tree reach 0.5; a much smaller one is drawn in their place for too long. A single faint
@@ -38,9 +36,9 @@ MIN_SIZE_RATIO = 1 / 3
 #: More than rounding adds to a mean, as a factor.
 ROUNDING = 1 + 1e-6
 
-#: A file is ordered coarse before fine if the median limit of its nodes' parents, at which the traversal refines them,
-#: does not rise by more than a factor `MAX_RISE` from one of `PARTS` equal parts to a later one. Trees with fewer than
-#: `MIN_NODES` children are not checked: chance decides there.
+#: Nodes are ordered coarse before fine if the median limit of their parents, the pixel scale at which the traversal
+#: refines them, rises by no more than the factor `MAX_RISE` from one of `PARTS` equal parts of the file to a later one.
+#: Trees with fewer than `MIN_NODES` children are not checked: there, chance decides.
 PARTS, MAX_RISE, MIN_NODES = 16, 1.6, 1024
 
 #: Columns of `Splats` that the facts of a tree, and findings about it, are computed from.
@@ -52,15 +50,15 @@ def parts_of(tree: LodTree) -> list[slice]:
     return blocks_of(len(tree), CHUNK_NODES)
 
 
-def node_text(tally: MaskTally, what: str) -> str:
-    """Return the text of a finding about nodes."""
-    return f"node {{first}} {what}{' (and {more} more)' if tally.count > 1 else ''}"
+def node_findings(tally: MaskTally, code: str, what: str) -> list[Finding]:
+    """Return a finding that says `what` of nodes, if there are any."""
+    return tally.finding(code, f"node {{first}} {what}{{rest}}", " (and {:,} more)")
 
 
 def link_findings(
     tree: LodTree, parent: NDArray[np.int32], references: NDArray[np.int32], depth: NDArray[np.int32], threads: int
 ) -> list[Finding]:
-    """Return findings about the links of a tree; `parent`, `references` and `depth` are those of its kernels."""
+    """Return findings about the links of a tree, from the results of `find_parents` and `find_depths`."""
     faults = {
         "tree.root": "is the root but the child of another node",
         "tree.range": f"has children beyond the last node, {len(tree) - 1:,}",
@@ -73,7 +71,7 @@ def link_findings(
     }
     cycles = find_cycles(parent, depth)
 
-    def tallied(part: slice) -> dict[str, MaskTally]:
+    def tallied(part: slice) -> Tallies:
         count, start, held = tree.child_count[part], tree.child_start[part].astype(np.int64), references[part]
         node = np.arange(part.start, part.stop)
         inner = count > 0
@@ -90,7 +88,7 @@ def link_findings(
 
     roots = tallies({"tree.root": references[:1] > 0}, 0)
     total = merged([roots, *ordered_map(tallied, parts_of(tree), threads)])
-    return [found for code, what in faults.items() for found in total[code].finding(code, node_text(total[code], what))]
+    return [found for code, what in faults.items() for found in node_findings(total[code], code, what)]
 
 
 def size_findings(
@@ -104,8 +102,8 @@ def size_findings(
     """Return findings about nodes that are much smaller than their children, by (N,) feature sizes.
 
     Args:
-        blocks: of the nodes; read if a node may be too small.
-        scale_ends: as for `tree.examine_blocks`.
+        blocks: read only if a node may be too small.
+        scale_ends: those of `examine`.
     """
     # No mean is larger than the largest child, but for rounding: in a good tree, nearly all nodes pass this test.
     marks = np.zeros(len(parent), np.bool_)
@@ -115,11 +113,11 @@ def size_findings(
     low, high = scale_ends
 
     def sized(block: Block) -> tuple[slice, NDArray[np.int32], NDArray[np.float64], Mask, Mask] | None:
-        """Return the data of a block for the comparison; None if none of its nodes is compared.
+        """Return the data of a block for the comparison; None if no node of it is compared.
 
-        Its place, the parents that its nodes are compared with, -1 for none, their weights in the mean size of those
-        parents' children, whether each is a line whose width, and so its area, the format cannot hold, and whether it
-        has a scale as large as the format holds.
+        These are the range of the block and, for each of its nodes: its parent, -1 if that is not compared; its weight
+        in the mean size of its siblings; whether it is a line, whose width, and so its area, the format cannot hold;
+        whether it has a scale as large as the format holds.
         """
         part, scale = block.part, block.splats.scale
         above = np.where(marks[parent[part]], parent[part], -1)
@@ -145,8 +143,8 @@ def size_findings(
             continue
         weight = weights[part]
         mean = np.divide(sums[part], weight, out=np.zeros(len(weight)), where=weight > 0)
-        small += MaskTally.of((size[part] < MIN_SIZE_RATIO * mean) & ~excused[part], part.start)
-    return small.finding("tree.size", node_text(small, "is less than a third as large as the mean of its children"))
+        small += tallies({"small": (size[part] < MIN_SIZE_RATIO * mean) & ~excused[part]}, part.start)["small"]
+    return node_findings(small, "tree.size", "is less than a third as large as the mean of its children")
 
 
 def order_findings(parent: NDArray[np.int32], limit: FloatArray, threads: int) -> list[Finding]:
@@ -207,11 +205,11 @@ class TreeFacts:
 
 @dataclass(frozen=True, eq=False)
 class TreeColumns:
-    """Columns of N nodes for the facts of their tree; 10 bytes a node.
+    """Columns of N nodes for the facts of their tree, which `add` fills; 10 bytes a node.
 
     Attributes:
-        tree: filled by `add`, unless it `is_whole`, in memory.
-        size: (N,) float32 feature sizes, world units; filled by `add`.
+        is_whole: the tree was in memory from the beginning.
+        size: (N,) float32 feature sizes, world units.
     """
 
     tree: LodTree
@@ -220,15 +218,13 @@ class TreeColumns:
 
     @classmethod
     def of(cls, blocks: ReportBlocks) -> TreeColumns:
-        """Return columns for the nodes of blocks, none of which has been added."""
+        """Return columns for the nodes of blocks, before any `add`."""
         count, tree = blocks.count, blocks.about.tree
-        size = np.empty(count, np.float32)
-        if tree is None:
-            return cls(LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32)), False, size)
-        return cls(tree, True, size)
+        blank = LodTree(np.empty(count, np.uint16), np.empty(count, np.uint32)) if tree is None else tree
+        return cls(blank, tree is not None, np.empty(count, np.float32))
 
-    def add(self, block: Block) -> dict[str, MaskTally]:
-        """Add the nodes of a block with the columns `USED`; return the tallies of its nodes and its leaves of D > 1."""
+    def add(self, block: Block) -> Tallies:
+        """Add the nodes of a block with the columns `USED`; return tallies of its nodes and its leaves with D > 1."""
         assert block.tree is not None
         part = block.part
         if not self.is_whole:
@@ -239,35 +235,26 @@ class TreeColumns:
 
 
 def examine(
-    splats: Splats, tree: LodTree, *, check: bool = True, scale_ends: tuple[float, float] = (0.0, math.inf)
-) -> tuple[TreeFacts, list[Finding]]:
-    """Return the facts of a tree of one or more nodes in memory and findings about it, see `examine_blocks`."""
-    blocks = ReportBlocks.of(Scene(splats, tree))
-    columns = TreeColumns.of(blocks)
-    opaque = merged(blocks.map(columns.add, USED, 1))
-    return examine_blocks(blocks, columns, opaque, check=check, scale_ends=scale_ends)
-
-
-def examine_blocks(
     blocks: ReportBlocks,
     columns: TreeColumns,
-    opaque: Mapping[str, MaskTally],
+    opaque: Tallies,
     *,
     check: bool,
-    scale_ends: tuple[float, float] = (0.0, math.inf),
-    in_chunks: bool = False,
-    threads: int = 1,
+    scale_ends: tuple[float, float],
+    in_chunks: bool,
+    threads: int,
 ) -> tuple[TreeFacts, list[Finding]]:
-    """Return the facts of a tree and findings about it; of a broken tree, those of the nodes that its root leads to.
+    """Return the facts of a tree of one or more nodes, and with `check` findings about it.
 
-    At most 31 bytes a node are in memory, those of `columns` among them; 18 where nothing is checked.
+    The facts of a broken tree are those of the nodes below its root. At most 31 bytes a node are in memory, those of
+    `columns` among them; 18 without a check.
 
     Args:
         blocks: read once more by a check, to compare nodes with their children.
-        opaque: tallies that `TreeColumns.add` returned of all blocks.
-        scale_ends: smallest and largest scale that the format holds, world units. A scale at one of them may have been
-            clamped.
-        in_chunks: the format orders nodes by chunks, so that they need not be coarse before fine.
+        columns: filled with all blocks.
+        opaque: tallies of all blocks from `TreeColumns.add`.
+        scale_ends: smallest and largest scale that the format holds, world units; scales at an end may be clamped.
+        in_chunks: the format orders nodes by chunks, so they need not be coarse before fine.
     """
     tree, size = columns.tree, columns.size
     depth, limit = find_depths(tree.child_count, tree.child_start, size)
@@ -304,8 +291,7 @@ def examine_blocks(
     parent, references = parents
     found = link_findings(tree, parent, references, depth, threads)
     del references, depth, parents
-    leaves_of_d = opaque["opaque leaves"]
-    found += leaves_of_d.finding("tree.leaf-opacity", node_text(leaves_of_d, "is a leaf with D > 1"))
+    found += node_findings(opaque["opaque leaves"], "tree.leaf-opacity", "is a leaf with D > 1")
     found += size_findings(blocks, tree, parent, size, scale_ends, threads)
     return facts, found if in_chunks else [*found, *order_findings(parent, limit, threads)]
 
@@ -313,9 +299,9 @@ def examine_blocks(
 def _coarse_cut(tree: LodTree, limit: FloatArray) -> tuple[NDArray[np.int64], int]:
     """Return the nodes of the cut that refines the largest nodes first, up to `CHUNK_NODES` nodes.
 
-    Also the number of inner nodes whose children lie in more than one chunk.
+    Also returns the number of inner nodes whose children lie in more than one chunk.
     """
-    # Each adds at least a node, so that no more than the largest ones can be refined.
+    # Refining a node adds at least one, so that only the `CHUNK_NODES` largest can be refined.
     counts = np.zeros(1 << LIMIT_BITS, np.int64)
     split = count_limits(tree.child_count, tree.child_start, limit, CHUNK_BITS, counts)
     above = np.cumsum(counts[::-1])[::-1]  # nodes of this limit or more

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -14,13 +15,12 @@ from ..codecs import quantize
 from ..codecs.losses import MOST_PAGED_DEGREE, LayoutLoss, clamp_matters, sample_loss
 from ..codecs.statistics import Distribution
 from ..model.gaussian import spark_size
-from ..model.scene import Scene
 from ..model.sh import COEFFICIENTS
-from ..model.splats import COLUMNS, FloatArray, Splats
+from ..model.splats import FloatArray, Splats
 from ..system.threads import ordered_map
 from ..tables.histograms import Histogram, histogram
-from .blocks import Block, Mask, MaskTally, ReportBlocks, largest, merged, smallest, tallies
-from .findings import Finding
+from .blocks import Block, ReportBlocks, largest, smallest
+from .findings import Finding, Mask, Tallies, merged, tallies
 
 #: Coordinates, whose percentiles are those of the box.
 AXES = ("x", "y", "z")
@@ -81,11 +81,9 @@ QUANTITIES = {
 #: The quantities of a report without --stats.
 MAIN = ("scale", "opacity", "anisotropy")
 #: Percentiles of a quantity, by name.
-PERCENTILES = {"p1": 1, "p25": 25, "p50": 50, "p75": 75, "p99": 99}
-#: The same, with the smallest and the largest number.
-LEVELS = {"min": 0, **PERCENTILES, "max": 100}
+LEVELS = {"min": 0, "p1": 1, "p25": 25, "p50": 50, "p75": 75, "p99": 99, "max": 100}
 
-#: Numbers of a quantity that are kept and sorted where a scene is read by chunk. Chosen.
+#: Most numbers of a quantity that are kept and sorted when a scene is read by chunk. Chosen.
 KEPT = 1 << 18
 
 
@@ -124,8 +122,8 @@ class Numbers:
             self._origin = float(np.median(values))
         most = float(np.finfo(np.float32).max)
         added = Distribution.of(np.clip(values - self._origin, -most, most).astype(np.float32))
-        known = [] if self._distribution is None else [self._distribution]
-        self._distribution = Distribution.merged([*known, added])
+        before = self._distribution
+        self._distribution = added if before is None else Distribution.merged([before, added])
 
     def summary(self) -> dict[str, float]:
         """Return the percentiles and the mean by name; empty without numbers."""
@@ -142,7 +140,7 @@ class Numbers:
 
 @dataclass(frozen=True)
 class Box:
-    """An axis-aligned box: (3,) lowest and highest corner, world units."""
+    """Axis-aligned box: its lowest and highest corner, (3,) world units."""
 
     min: list[float]
     max: list[float]
@@ -150,7 +148,7 @@ class Box:
 
 @dataclass(frozen=True)
 class ValueFacts:
-    """Statistics of splats; invalid ones (`splats.INVALID`) are counted but left out of the rest. See `schema.json`."""
+    """Statistics of valid splats, and the number of invalid ones (`splats.INVALID`); `schema.json` has the fields."""
 
     box: Box | None
     box_98: Box | None
@@ -163,30 +161,23 @@ class ValueFacts:
 
 
 def names_of(splats: Splats) -> list[str]:
-    """Return the names of the quantities of splats, without SH of higher degrees."""
+    """Return the names of the quantities that splats of this SH degree have."""
     return [name for name, row in QUANTITIES.items() if row.sh_degree <= splats.sh_degree]
 
 
 def quantity(splats: Splats, name: str) -> FloatArray:
-    """(N,) a quantity by its name, which may not be finite."""
+    """Compute the (N,) numbers of a quantity, finite or not."""
     with np.errstate(all="ignore"):
         return QUANTITIES[name].of(splats)
 
 
 def histogram_of(splats: Splats, name: str, *, bins: int = 40) -> Histogram:
-    """Return the histogram of one of `names_of(splats)`, by its name."""
+    """Count the numbers of a quantity, one of `names_of(splats)`, in bins."""
     return histogram(quantity(splats, name), bins=bins, log=False if QUANTITIES[name].linear else None)
 
 
-def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
-    """Statistics of N splats in memory."""
-    blocks = ReportBlocks.of(Scene(splats))
-    tally = ValueTally.total(blocks.map(lambda block: ValueTally.of(block, Ends()), COLUMNS, 1))
-    return statistics_of(blocks, tally, all_quantities=all_quantities, threads=1)
-
-
 def statistics_of(blocks: ReportBlocks, tally: ValueTally, *, all_quantities: bool, threads: int) -> ValueFacts:
-    """Statistics of splats, which are read once more; in memory, threads work on quantities of different columns."""
+    """Compute statistics, for which all blocks are read again; in memory, threads share the quantities by columns."""
     none = blocks.about.splats.take(slice(0))
     shown = names_of(none) if all_quantities else MAIN
     groups: dict[tuple[str, ...], list[str]] = {}
@@ -216,12 +207,12 @@ def statistics_of(blocks: ReportBlocks, tally: ValueTally, *, all_quantities: bo
     return ValueFacts(
         box,
         box_98,
-        tally.number("non_finite"),
-        tally.number("negative_scale"),
-        tally.number("transparent"),
-        tally.number("without scale"),
-        tally.number("opaque"),
-        {name: {key: found[name].get(key) for key in (*LEVELS, "mean")} for name in shown},
+        non_finite=tally.by_name["non_finite"].count,
+        negative_scale=tally.by_name["negative_scale"].count,
+        zero_opacity=tally.by_name["transparent"].count,
+        zero_scale=tally.by_name["without scale"].count,
+        more_than_opaque=tally.by_name["opaque"].count,
+        quantities={name: {key: found[name].get(key) for key in (*LEVELS, "mean")} for name in shown},
     )
 
 
@@ -233,7 +224,7 @@ def _numbers(values: NDArray[Any]) -> list[float]:
     return [_number(value) for value in values]
 
 
-#: Code and message of each reason that makes a splat invalid (`splats.INVALID`).
+#: Code and message of each kind of invalid splats (`splats.INVALID`).
 OF_INVALID = {
     "non_finite": ("values.non-finite", "a number is not finite, or the rotation has length 0"),
     "bad_rotation": ("values.rotation", "the length of the rotation is not 1"),
@@ -244,11 +235,11 @@ OF_INVALID = {
 #: Share of splats above which invisible ones are a finding: a few are the rounding of good files.
 MANY_INVISIBLE = 0.1
 
-#: Loss of colours in one of Spark's layouts, dB, below which pictures differ visibly, and by how much more than in the
-#: other it is worth a hint: twice the error. Chosen.
+#: PSNR of colours in one of Spark's layouts, dB, below which pictures differ visibly, and how much higher that of the
+#: other layout is when a hint is worthwhile: half the error. Chosen.
 VISIBLE_LOSS, LOSS_APART = 35, 6
 
-#: Splats of a block that stand for it where this loss is measured.
+#: Splats of a block for which this loss is measured.
 BLOCK_SAMPLE = 4096
 
 #: Coordinates from this on become infinite in float16, which Spark's PackedSplats use.
@@ -257,7 +248,7 @@ FLOAT16_END = 65_520
 
 @dataclass(frozen=True)
 class Ends:
-    """The numbers at which a file's codes end; values at one of them may have been clamped.
+    """Limits of the codes of a file; values at a limit may have been clamped.
 
     Attributes:
         scale: smallest and largest scale, world units; 0 and infinity for floats.
@@ -269,7 +260,7 @@ class Ends:
 
 
 def ends_of(header: Mapping[str, int]) -> Ends:
-    """Return the ends of the codes of an SPZ file by its header; none for other formats, which have floats."""
+    """Return the limits of the codes of an SPZ file from its header; infinite for other formats, which have floats."""
     if "fractional_bits" not in header:
         return Ends()
     low, high = quantize.decode_log_scale(np.array([0, 255], np.uint8))
@@ -282,19 +273,15 @@ class ValueTally:
     """Tallies of splats by their values.
 
     Attributes:
-        checked: number of splats of which few may be invisible or clamped: the leaves of a tree, or all.
-        invisible: of these, valid or not.
-        by_name: tallies of valid splats that are "opaque", "invisible", "transparent", ..., and of the kinds of
-            `splats.INVALID`.
-        valid: masks of valid splats, by the start of each block in which some are not.
+        by_name: of valid splats that are "opaque", "invisible", "transparent" etc.; of the kinds of `splats.INVALID`;
+            of "all" splats; of those of which few may be invisible or clamped, the leaves of a tree or all, as
+            "checked"; and of the invisible among these, valid or not, as "unseen".
+        valid: masks of valid splats, by the start of each block that has invalid ones.
         low, high: (3,) corners of the box of the centres of valid splats; infinite without any.
         layouts: loss of a sample in Spark's layouts.
     """
 
-    count: int
-    checked: int
-    invisible: int
-    by_name: dict[str, MaskTally]
+    by_name: Tallies
     valid: dict[int, Mask]
     low: FloatArray
     high: FloatArray
@@ -302,32 +289,34 @@ class ValueTally:
 
     @classmethod
     def of(cls, block: Block, ends: Ends, *, layouts: bool = False) -> ValueTally:
-        """Tallies of a block with the columns center, scale and opacity; all columns to measure losses in `layouts`."""
+        """Tally a block with the columns center, scale and opacity; losses in `layouts` take all columns."""
         opacity, most = block.splats.opacity, largest(block.splats.scale)
-        furthest, valid = largest(np.abs(block.splats.center)), block.valid
-        checked = np.ones(len(opacity), np.bool_) if block.tree is None else block.tree.is_leaf
+        furthest, invalid = largest(np.abs(block.splats.center)), block.splats.invalid()
+        every = np.ones(len(opacity), np.bool_)
+        valid = ~np.logical_or.reduce([~every, *invalid.values()])
         # Merged splats of thin leaves far apart may be fainter than any code, or larger.
-        invisible = checked & ((opacity == 0) | (most == 0))
+        checked = every if block.tree is None else block.tree.is_leaf
+        unseen = checked & ((opacity == 0) | (most == 0))
         masks = {
-            **block.invalid,
+            **invalid,
+            "all": every,
+            "checked": checked,
+            "unseen": unseen,
             "opaque": valid & (opacity > 1),
             "transparent": valid & (opacity == 0),
             "without scale": valid & (most == 0),
-            "invisible": valid & invisible,
+            "invisible": valid & unseen,
             "center": valid & (furthest >= ends.center),
             "far": valid & (furthest >= FLOAT16_END),
         }
         low, high = ends.scale
-        if high < math.inf:  # see `encoder.tally` for what of it can be seen
+        if high < math.inf:  # `encoder.tally` says which clamped scales can be seen
             masks["small"] = checked & valid & (most > 0) & (most <= low)
             masks["large"] = checked & valid & (most >= high)
-        center = block.splats.center[valid] if block.invalid else block.splats.center
+        center = block.splats.center[valid] if invalid else block.splats.center
         return cls(
-            len(opacity),
-            int(np.count_nonzero(checked)),
-            int(np.count_nonzero(invisible)),
             tallies(masks, block.start),
-            {block.start: valid} if block.invalid else {},
+            {block.start: valid} if invalid else {},
             np.array([axis.min(initial=np.inf) for axis in center.T]),
             np.array([axis.max(initial=-np.inf) for axis in center.T]),
             sample_loss(block.splats, BLOCK_SAMPLE) if layouts else LayoutLoss(),
@@ -335,57 +324,38 @@ class ValueTally:
 
     @classmethod
     def total(cls, parts: Iterable[ValueTally]) -> ValueTally:
-        """Tallies of all blocks, in order."""
+        """Add the tallies of all blocks, in order."""
         every = list(parts)
-        valid = {start: mask for part in every for start, mask in part.valid.items()}
-        low, high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
-        for part in every:
-            low, high = np.minimum(low, part.low), np.maximum(high, part.high)
         return cls(
-            sum(part.count for part in every),
-            sum(part.checked for part in every),
-            sum(part.invisible for part in every),
             merged(part.by_name for part in every),
-            valid,
-            low,
-            high,
+            {start: mask for part in every for start, mask in part.valid.items()},
+            functools.reduce(np.minimum, (part.low for part in every), np.full(3, np.inf, np.float32)),
+            functools.reduce(np.maximum, (part.high for part in every), np.full(3, -np.inf, np.float32)),
             LayoutLoss.total(part.layouts for part in every),
         )
 
-    def number(self, name: str) -> int:
-        """Return the number of splats in a tally."""
-        return self.by_name.get(name, MaskTally()).count
 
-
-def check(scene: Scene) -> list[Finding]:
-    """Return findings about the values of a scene in memory."""
-    ends, blocks = ends_of(scene.header), ReportBlocks.of(scene)
-    parts = blocks.map(lambda block: ValueTally.of(block, ends), COLUMNS, 1)
-    return findings_about(ValueTally.total(parts), ends, is_tree=blocks.is_tree)
-
-
-def findings_about(values: ValueTally, ends: Ends, *, is_tree: bool) -> list[Finding]:
-    """Return findings about the values of all splats of a file."""
-    if not values.count:
+def findings_about(tallied: Tallies, ends: Ends, *, merged_splats: bool) -> list[Finding]:
+    """Return findings about the values of all splats of a file, `ValueTally.by_name`, some of which may be merged."""
+    if not tallied["all"].count:
         return [Finding("values.empty", "there are no splats")]
     findings: list[Finding] = []
 
     def report(code: str, name: str, text: str) -> None:
-        tally = values.by_name.get(name, MaskTally())
-        more = " and {more} more" if tally.count > 1 else ""
-        findings.extend(tally.finding(code, f"splat {{first}}{more}: {text}"))
+        findings.extend(tallied[name].finding(code, f"splat {{first}}{{rest}}: {text}"))
 
     for kind, (code, text) in OF_INVALID.items():
         report(code, kind, text)
-    if not is_tree:
+    if not merged_splats:
         report("values.opacity", "opaque", "the opacity is above 1")
-    if values.invisible > MANY_INVISIBLE * values.checked:
+    if tallied["unseen"].count > MANY_INVISIBLE * tallied["checked"].count:
         report("values.invisible", "invisible", "cannot be drawn, as its opacity or scale is 0")
     if ends.center < math.inf:
         text = f"a coordinate is {ends.center:g}, the end of the range of its code"
         report("values.center-clamped", "center", text)
     for name, end in zip(("small", "large"), ends.scale, strict=True):
-        if clamp_matters("scale", above=name == "large", visible=values.number(name), leaves=values.checked):
+        leaves, visible = tallied["checked"].count, tallied[name].count
+        if clamp_matters("scale", above=name == "large", visible=visible, leaves=leaves):
             text = f"a scale is {end:.2g}, the end of the range of its code; RAD with --rad-scales ln_f16 keeps such"
             report("values.scale-clamped", name, text)
     report("values.center-far", "far", f"a coordinate is {FLOAT16_END:,} or more, which float16 cannot hold")
@@ -393,7 +363,7 @@ def findings_about(values: ValueTally, ends: Ends, *, is_tree: bool) -> list[Fin
 
 
 def hints_about(loss: LayoutLoss, sh_degree: int) -> list[str]:
-    """Return a hint where one of Spark's layouts is visibly worse than the other."""
+    """Return a hint if one of Spark's layouts is visibly worse than the other."""
     ext, packed = loss.psnr("ext"), loss.psnr("packed")
     if min(ext, packed) >= VISIBLE_LOSS or abs(ext - packed) < LOSS_APART:
         return []

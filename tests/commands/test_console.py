@@ -421,7 +421,7 @@ def test_a_file_too_large_for_memory_does_not_stop_the_others(cli: Cli, monkeypa
 
         return build
 
-    monkeypatch.setattr(tree, "examine_blocks", full_once(tree.examine_blocks))
+    monkeypatch.setattr(tree, "examine", full_once(tree.examine))
     monkeypatch.setattr(quick, "build", full_once(quick.build))
     for line in ("inspect hand-tree-v3.spz hand-tree-v3.spz --check", "build-lod sh0.ply one.ply"):
         first, second = cli(line, status=1).err.splitlines()

@@ -18,7 +18,6 @@ from sparklod_cli.fitting.fit import AHEAD, LAST, RATES, STAGES, Schedule, defau
 from sparklod_cli.fitting.fit_settings import SHARES, FitSettings, Refined
 from sparklod_cli.fitting.kernels.adam import Rates
 from sparklod_cli.fitting.pictures import FittedNodes, FullDetailPicture, Index, Optimiser, Place, pictures, scores_of
-from sparklod_cli.inspection.tree import examine
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quality, quick
 from sparklod_cli.model.lod_tree import LodTree
@@ -26,6 +25,7 @@ from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.system.errors import BackendError
 from tests.conftest import FIXTURES
+from tests.inspection import examine_tree
 from tests.scenes import random_splats
 
 #: Steps of quick tests.
@@ -69,7 +69,7 @@ def test_a_fit_changes_merged_splats_of_its_result_only() -> None:
     assert not result.invalid()
     assert (result.scale > 0).all()
     assert result.opacity.min() > 0 and result.opacity.max() <= 1000
-    assert examine(result, tree)[1] == []
+    assert examine_tree(result, tree)[1] == []
 
 
 @pytest.mark.slow

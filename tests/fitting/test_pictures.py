@@ -28,10 +28,10 @@ from sparklod_cli.fitting.pictures import (
     smaller,
     split_path,
 )
-from sparklod_cli.inspection.tree import examine
 from sparklod_cli.lod import quality
 from sparklod_cli.render.rasterizer import draw
 from sparklod_cli.render.render_settings import RasterSettings
+from tests.inspection import examine_tree
 from tests.scenes import random_splats
 
 #: Share of a tree's leaves that its cuts have.
@@ -145,7 +145,7 @@ def test_long_steps_stay_within_bounds(nodes: FittedNodes) -> None:
 
 
 def findings_of(nodes: FittedNodes) -> list[str]:
-    return [finding.code for finding in examine(nodes.result(), nodes.tree)[1]]
+    return [finding.code for finding in examine_tree(nodes.result(), nodes.tree)[1]]
 
 
 def test_nodes_smaller_than_their_children_get_their_first_values(nodes: FittedNodes) -> None:

@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 
 from sparklod_cli.inspection import tree as facts_of
 from sparklod_cli.inspection.findings import Finding
-from sparklod_cli.inspection.tree import TreeFacts, examine
+from sparklod_cli.inspection.tree import TreeFacts
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.kernels.tree_links import find_depths, find_parents
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
+from tests.inspection import examine_tree as examine
 from tests.references import tree_links
 from tests.scenes import random_splats
 
@@ -175,11 +176,6 @@ def test_a_finding_counts_and_names_the_first() -> None:
     assert (orphans.code, orphans.index, orphans.count) == ("tree.orphan", 3, 2)
     assert orphans.message == "node 3 has no parent (and 1 more)"
     assert (starts.code, starts.index, starts.count, starts.severity) == ("tree.leaf-start", 4, 1, "warning")
-
-
-def test_without_a_check_nothing_is_looked_for() -> None:
-    facts, findings = examine(sized([1.0, 1.0]), tree_of([(0, 0), (0, 0)]), check=False)
-    assert (facts.leaves, findings) == (2, [])
 
 
 @pytest.mark.parametrize(("size", "found"), [(0.99, True), (1.01, False), (3.0, False), (0.0, True)])

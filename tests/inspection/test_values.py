@@ -18,28 +18,30 @@ from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.codecs import ply, spz
 from sparklod_cli.codecs.spz import ANTIALIASED, HEADER, LOD, MAGIC, Layout
+from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.report import ReportSettings, inspect
-from sparklod_cli.inspection.values import (
-    LEVELS,
-    MAIN,
-    PERCENTILES,
-    QUANTITIES,
-    Numbers,
-    check,
-    examine,
-    names_of,
-    quantity,
-)
+from sparklod_cli.inspection.values import LEVELS, MAIN, QUANTITIES, Numbers, ValueFacts, names_of, quantity
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import COLUMNS, Splats
 from tests.conftest import FIXTURES
+from tests.inspection import report_of
 from tests.scenes import random_splats
 
 NAN, INF = math.nan, math.inf
 EXACT = 1e-5  # of six digits
+
+
+def examine(splats: Splats, *, all_quantities: bool = False) -> ValueFacts:
+    facts = report_of(Scene(splats), values=True, all_quantities=all_quantities).values
+    assert facts is not None
+    return facts
+
+
+def check(scene: Scene) -> list[Finding]:
+    return [each for each in report_of(scene, check=True).findings or [] if each.code.startswith("values.")]
 
 
 def three() -> Splats:
@@ -139,8 +141,7 @@ def test_facts_are_those_of_numpy_over_the_finite_splats(seed: int) -> None:
     }
     for name, numbers in expected.items():
         summary = facts.quantities[name]
-        levels = {"min": 0, **PERCENTILES, "max": 100}
-        for key, level in levels.items():
+        for key, level in LEVELS.items():
             assert summary[key] == pytest.approx(np.percentile(numbers, level), rel=EXACT, abs=1e-9), (name, key)
         assert summary["mean"] == pytest.approx(numbers.mean(), rel=EXACT)
 
