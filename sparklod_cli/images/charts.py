@@ -1,4 +1,4 @@
-"""Charts of tables, and the figure of `traverse --plot`. No other module imports matplotlib."""
+"""Charts of a traversal (`traverse --plot`) and of a comparison. Only this module imports matplotlib."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from ..system.errors import SparklodError, optional_import
-from ..system.units import percent_of
+from ..system.units import count_of, percent_of
 from ..tables.columns import Row, numbers, totals
 from .pixels import BACKGROUND, FAINT, INK, LINE, write_title
 from .scene_plots import PathScene, picture_of_path
@@ -24,9 +24,11 @@ GREEN, BLUE, INDIGO, ORANGE, YELLOW, PINK = "#44bf70", "#2a788e", "#414487", "#e
 #: (N,) numbers, one for each row.
 Series = NDArray[np.float64]
 
+Axes = Any
+
 
 class FrameColumns:
-    """Columns of rows as arrays, along an axis of time or of frame numbers.
+    """Columns of a table as arrays, along an axis of time or of frame numbers.
 
     Attributes:
         x: (N,) seconds; frame numbers where the rows have no times.
@@ -49,21 +51,15 @@ class FrameColumns:
         return all(numbers(self.rows, name) for name in names)
 
     def column(self, name: str) -> Series:
+        """Return the cells of a column, NaN where a cell is empty."""
         return np.array([np.nan if row[name] is None else row[name] for row in self.rows], np.float64)
 
-    def ratio(self, name: str, of: str) -> Series:
-        """(N,) one column over another; NaN where a cell is empty, or the other is 0."""
-        above, below = self.column(name), self.column(of)
-        return np.divide(above, below, out=np.full(len(above), np.nan), where=below != 0)
 
-
-#: Resolution in pixels an inch, and width of a figure in pixels.
+#: Resolution in pixels per inch, and width of a figure in pixels.
 DPI, WIDTH = 100, 1600
 
-#: Ground of a chart.
+#: Background of a chart.
 PANEL = "#141b24"
-
-Axes = Any
 
 
 def load_matplotlib() -> ModuleType:
@@ -89,9 +85,11 @@ STYLE = {
 
 
 def draw(lines: int, height: int, fill: Callable[[ModuleType, NDArray[Any]], None]) -> NDArray[np.uint8]:
-    """(H, WIDTH, 3) a figure in the style of this package, whatever a matplotlibrc says.
+    """Draw a figure of two columns of charts in `STYLE`, ignoring any matplotlibrc; return (H, WIDTH, 3) pixels.
 
-    `fill` draws into the axes of the charts, (2 lines,), given matplotlib and these.
+    Args:
+        lines: rows of charts, each `height` pixels high.
+        fill: draws the charts, given matplotlib and their (2 * lines,) axes.
     """
     matplotlib = load_matplotlib()
     with matplotlib.rc_context():
@@ -106,17 +104,12 @@ def draw(lines: int, height: int, fill: Callable[[ModuleType, NDArray[Any]], Non
     return pixels
 
 
-def head(title: str, lines: Sequence[tuple[str, str]], height: int) -> Image.Image:
-    """Title of a figure and lines below it, each a text and a colour."""
-    image = Image.new("RGB", (WIDTH, height), BACKGROUND)
-    write_title(ImageDraw.Draw(image), 1.0, title, lines)
-    return image
-
-
-def stacked(*images: Image.Image | NDArray[np.uint8]) -> bytes:
-    """Return the PNG of images of the same width, stacked from top to bottom."""
+def _figure(title: str, lines: Sequence[tuple[str, str]], height: int, *images: NDArray[np.uint8]) -> bytes:
+    """Return the PNG of images of `WIDTH`, from top to bottom, below a title and lines of text with their colours."""
+    head = Image.new("RGB", (WIDTH, height), BACKGROUND)
+    write_title(ImageDraw.Draw(head), 1.0, title, lines)
     out = io.BytesIO()
-    Image.fromarray(np.concatenate([np.asarray(image) for image in images])).save(out, "PNG", optimize=True)
+    Image.fromarray(np.concatenate([np.asarray(head), *images])).save(out, "PNG", optimize=True)
     return out.getvalue()
 
 
@@ -126,15 +119,14 @@ COMPARISON_ROW, COMPARISON_HEAD = 420, 122
 #: Colours of the budgets, in their order; with more budgets than colours they repeat.
 COLORS = (INDIGO, BLUE, GREEN, YELLOW, ORANGE, PINK)
 
-#: The rows of a budget, one for each frame, and the budget as it was given ("5%").
+#: A budget as it was given ("5%"), and its rows, one for each frame.
 BudgetRows = tuple[str, Sequence[Row]]
 
 
 def plot_comparison(series: Sequence[BudgetRows], title: str) -> bytes:
-    """Return the PNG of charts: PSNR, SSIM and PSNR of edges by budget, PSNR, worst tile and popping along the path.
+    """Draw the quality of pictures by budget and along the path, and return the PNG.
 
-    A chart of which no frame has a value, such as popping of single views, is left out. All budgets have the same
-    frames.
+    All budgets have the same frames. A chart without a value, such as popping of single views, is omitted.
     """
     groups, frames = [rows for _, rows in series], len(series[0][1])
 
@@ -146,14 +138,14 @@ def plot_comparison(series: Sequence[BudgetRows], title: str) -> bytes:
         _by_frame(grid[4], series, "worst_tile_psnr", "PSNR of the worst tile", "dB")
         _by_frame(grid[5], series, "popping", "Popping along the path", "steps of 8 bits")
 
-    about = f"against full detail, {frames:,} frame{'s' * (frames > 1)}, on black and on white"
-    return stacked(head(title, [(about, FAINT)], COMPARISON_HEAD), draw(3, COMPARISON_ROW, fill))
+    about = f"against full detail, {count_of(frames, 'frame')}, on black and on white"
+    return _figure(title, [(about, FAINT)], COMPARISON_HEAD, draw(3, COMPARISON_ROW, fill))
 
 
 def _by_budget(
     matplotlib: ModuleType, axes: Axes, groups: Sequence[Sequence[Row]], name: str, title: str, unit: str
 ) -> None:
-    """Mean over the frames, in all and on either background, and the range from the lowest to the highest frame."""
+    """Draw the mean over all frames, in total and per background, and the range of the frames."""
     if not all(numbers(rows, name) for rows in groups):
         axes.set_visible(False)
         return
@@ -171,13 +163,13 @@ def _by_budget(
     axes.set_xticks(share)
     axes.xaxis.set_major_formatter(lambda value, place: percent_of(value))
     axes.xaxis.set_minor_locator(matplotlib.ticker.NullLocator())
-    _named(axes, title, unit, loc="lower right", ncols=4)
+    _label(axes, title, unit, ncols=4)
 
 
-def _named(axes: Axes, title: str, unit: str, **legend: Any) -> None:
+def _label(axes: Axes, title: str, unit: str, **legend: Any) -> None:
     axes.set_title(title)
     axes.set_ylabel(unit)
-    axes.legend(borderpad=0, handlelength=1.4, **legend)
+    axes.legend(loc="lower right", borderpad=0, handlelength=1.4, **legend)
 
 
 def _by_frame(axes: Axes, series: Sequence[BudgetRows], name: str, title: str, unit: str) -> None:
@@ -189,7 +181,7 @@ def _by_frame(axes: Axes, series: Sequence[BudgetRows], name: str, title: str, u
         axes.plot(frames.x, frames.column(name), color=COLORS[at % len(COLORS)], linewidth=1.4, label=budget)
         axes.xaxis.set_major_formatter(frames.tick)
         axes.set_xlim(frames.x[0], frames.x[-1])
-    _named(axes, title, unit, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(series))
+    _label(axes, title, unit, bbox_to_anchor=(1.0, 1.0), ncols=len(series))
 
 
 #: Height of a row of two charts, pixels.
@@ -201,10 +193,10 @@ HEADROOM = 1.22
 
 @dataclass(frozen=True)
 class Panel:
-    """One chart of the figure.
+    """A chart of the figure.
 
     Attributes:
-        columns: that the chart needs; without a number in each of them it is left out.
+        columns: required columns; without a number in each of them the chart is omitted.
         draw: draws into matplotlib's axes and returns (N,) heights at which frames are marked.
         marks: criteria by which frames are marked in this chart.
     """
@@ -215,7 +207,7 @@ class Panel:
     marks: tuple[str, ...] = ()
 
 
-def _drawn(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
+def _selected(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     _stack(axes, frames, matplotlib, (("leaves", "leaves", GREEN), ("merged", "interior", BLUE)))
     budget = frames.column("budget")
     axes.plot(frames.x, budget, color=YELLOW, linewidth=1.4, label="budget")
@@ -223,7 +215,7 @@ def _drawn(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     return frames.column("selected")
 
 
-def _where(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
+def _frustum(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     parts = (("inside", "in_frustum", GREEN), ("outside", "outside", BLUE), ("behind", "behind", INDIGO))
     _stack(axes, frames, matplotlib, parts)
     return frames.column("in_frustum")
@@ -236,29 +228,35 @@ def _stack(axes: Axes, frames: FrameColumns, matplotlib: ModuleType, parts: Sequ
         axes.fill_between(frames.x, floor, top, color=color, linewidth=0, label=label)
         floor = top
     axes.set_ylim(0, max(float(floor.max()) * 1.03, 1))
-    _counted(axes, matplotlib)
+    _use_whole_ticks(axes, matplotlib)
     axes.set_ylabel("splats")
 
 
-def _from_zero(axes: Axes, values: Series) -> None:
+def _start_at_zero(axes: Axes, values: Series) -> None:
     axes.set_ylim(0, HEADROOM * float(np.nanmax(values)) or 1)
 
 
-def _counted(axes: Axes, matplotlib: ModuleType, unit: str = "") -> None:
+def _use_whole_ticks(axes: Axes, matplotlib: ModuleType, unit: str = "") -> None:
     """Give the vertical axis ticks at whole numbers, with k and M for thousands and millions."""
     axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6, steps=[1, 2, 5, 10], integer=True, min_n_ticks=1))
     axes.yaxis.set_major_formatter(matplotlib.ticker.EngFormatter(unit, sep=" " if unit else ""))
 
 
-def _beside(axes: Axes) -> Axes:
-    other = axes.twinx()
-    other.grid(False)
-    return other
+def _second_line(axes: Axes, frames: FrameColumns, values: Series, label: str) -> Axes:
+    """Draw a green line against a second vertical axis, which is returned, and add it to the legend of the first."""
+    second = axes.twinx()
+    second.grid(False)
+    second.plot(frames.x, values, color=GREEN, linewidth=1.6)
+    axes.plot([], [], color=GREEN, linewidth=1.6, label=label)
+    _start_at_zero(second, values)
+    second.set_ylabel(label)
+    return second
 
 
-def _coarse(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
-    values = frames.ratio("pixel_scale_min", "pixel_scale_limit")
-    values[~(values > 0)] = np.nan
+def _pixel_scale(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = frames.column("pixel_scale_min") / frames.column("pixel_scale_limit")
+    values[~((values > 0) & np.isfinite(values))] = np.nan
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.4)
     axes.axhline(1, color=FAINT, linewidth=1, linestyle=(0, (4, 3)), label="limit")
     axes.set_yscale("log", base=2)
@@ -275,7 +273,7 @@ def _churn(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     axes.fill_between(frames.x, 0, values, color=ORANGE, alpha=0.25, linewidth=0)
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.2)
     axes.yaxis.set_major_formatter(lambda value, place: percent_of(value))
-    _from_zero(axes, values)
+    _start_at_zero(axes, values)
     axes.set_ylabel("share of splats")
     return values
 
@@ -284,16 +282,10 @@ def _fetched(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series
     values = frames.column("bytes_new")
     some = values > 0
     axes.vlines(frames.x[some], 0, values[some], color=ORANGE, linewidth=1.8, label="per frame")
-    _counted(axes, matplotlib, "B")
-    _from_zero(axes, values)
+    _use_whole_ticks(axes, matplotlib, "B")
+    _start_at_zero(axes, values)
     axes.set_ylabel("per frame")
-    total = _beside(axes)
-    fetched = np.nancumsum(values)
-    total.plot(frames.x, fetched, color=GREEN, linewidth=1.6)
-    axes.plot([], [], color=GREEN, linewidth=1.6, label="total")
-    _counted(total, matplotlib, "B")
-    _from_zero(total, fetched)
-    total.set_ylabel("total")
+    _use_whole_ticks(_second_line(axes, frames, np.nancumsum(values), "total"), matplotlib, "B")
     return values
 
 
@@ -301,16 +293,11 @@ def _cache(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     values = frames.column("missing")
     axes.fill_between(frames.x, 0, values, color=ORANGE, alpha=0.35, linewidth=0)
     axes.plot(frames.x, values, color=ORANGE, linewidth=1.2, label="nodes missing")
-    _from_zero(axes, values)
-    _counted(axes, matplotlib)
+    _start_at_zero(axes, values)
+    _use_whole_ticks(axes, matplotlib)
     axes.set_ylabel("nodes missing")
-    chunks = _beside(axes)
-    resident = frames.column("chunks_resident")
-    chunks.plot(frames.x, resident, color=GREEN, linewidth=1.6)
-    axes.plot([], [], color=GREEN, linewidth=1.6, label="chunks resident")
-    _from_zero(chunks, resident)
+    chunks = _second_line(axes, frames, frames.column("chunks_resident"), "chunks resident")
     chunks.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(5, integer=True))
-    chunks.set_ylabel("chunks resident")
     return values
 
 
@@ -319,7 +306,7 @@ def _depths(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
     axes.fill_between(frames.x, frames.column("level_min"), most, color=BLUE, alpha=0.5, linewidth=0, label="range")
     axes.plot(frames.x, mean, color=GREEN, linewidth=1.6, label="mean")
     axes.yaxis.set_major_locator(matplotlib.ticker.MaxNLocator(6, integer=True))
-    _from_zero(axes, most)
+    _start_at_zero(axes, most)
     if frames.has("pixel_scale_limit"):
         axes.set_ylabel("edges from the root")
     else:  # only trees have such a limit
@@ -332,7 +319,7 @@ def _line(name: str, unit: str, color: str) -> Callable[[Axes, FrameColumns, Mod
     def draw(axes: Axes, frames: FrameColumns, matplotlib: ModuleType) -> Series:
         values = frames.column(name)
         axes.plot(frames.x, values, color=color, linewidth=1.3)
-        _from_zero(axes, values)
+        _start_at_zero(axes, values)
         axes.set_ylabel(unit)
         return values
 
@@ -340,10 +327,10 @@ def _line(name: str, unit: str, color: str) -> Callable[[Axes, FrameColumns, Mod
 
 
 PANELS = (
-    Panel("Splats drawn", ("leaves", "interior", "budget"), _drawn),
-    Panel("Inside or outside the frustum", ("in_frustum", "outside", "behind"), _where),
+    Panel("Splats drawn", ("leaves", "interior", "budget"), _selected),
+    Panel("Inside or outside the frustum", ("in_frustum", "outside", "behind"), _frustum),
     Panel("Depth of the cut", ("level_min", "level_mean", "level_max"), _depths),
-    Panel("Pixel scale", ("pixel_scale_min", "pixel_scale_limit"), _coarse, ("coarsest",)),
+    Panel("Pixel scale", ("pixel_scale_min", "pixel_scale_limit"), _pixel_scale, ("coarsest",)),
     Panel("Churn", ("churn",), _churn, ("churn",)),
     Panel("Bytes fetched", ("bytes_new",), _fetched, ("bytes",)),
     Panel("Chunk cache", ("missing", "chunks_resident"), _cache, ("missing",)),
@@ -356,7 +343,7 @@ PANELS = (
 
 
 #: Labels of the criteria by which frames are marked (`simulation.results.MOMENTS`).
-CALLED = {
+LABELS = {
     "churn": "most churn",
     "bytes": "most bytes fetched",
     "coarsest": "coarsest",
@@ -369,33 +356,34 @@ CALLED = {
 def plot(
     rows: Iterable[Row], marked: Mapping[str, int], title: str, scene: PathScene | None = None
 ) -> tuple[bytes, str | None]:
-    """Return the PNG of charts of all columns that have numbers, and of the path; a note says why that is missing.
+    """Draw charts of a traversal, with its path below them, and return the PNG.
 
     Args:
-        rows: of all frames, at least one; those of single instances are left out.
-        marked: numbers of notable frames by criterion, a key of `CALLED`.
+        rows: table of the traversal; rows of single instances are ignored.
+        marked: numbers of notable frames by criterion, a key of `LABELS`.
+
+    Returns:
+        The PNG, and the reason why the picture of the path is missing, None if it is not.
     """
     frames = totals(rows)
     if not frames:
         raise SparklodError("there is nothing to draw: the path has no frames")
     lines = [(_about(frames), FAINT)]
     if marked:
-        lines.append((", ".join(f"{CALLED[reason]}: frame {number:,}" for reason, number in marked.items()), PINK))
+        lines.append((", ".join(f"{LABELS[reason]}: frame {number:,}" for reason, number in marked.items()), PINK))
     title = "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in title)
     title = title if len(title) <= 100 else f"{title[:99]}…"
-    images: list[Any] = [head(title, lines, 96 + 26 * len(lines)), draw_charts(frames, marked)]
-    note = None
+    images, note = [draw_charts(frames, marked)], None
     if scene is not None:
         try:
-            picture = picture_of_path(scene)
-            images.append(Image.open(io.BytesIO(picture)).convert("RGB"))
+            images.append(np.asarray(Image.open(io.BytesIO(picture_of_path(scene))).convert("RGB")))
         except SparklodError as error:
             note = f"drawn without the picture of the path: {error}"
-    return stacked(*images), note
+    return _figure(title, lines, 96 + 26 * len(lines), *images), note
 
 
 def _about(frames: Sequence[Row]) -> str:
-    said = [f"{len(frames):,} frame" + ("" if len(frames) == 1 else "s")]
+    said = [count_of(len(frames), "frame")]
     times = numbers(frames, "time_s")
     if len(set(times)) > 1:
         said.append(f"{times[-1] - times[0]:.3f} s")
@@ -404,14 +392,13 @@ def _about(frames: Sequence[Row]) -> str:
         said.append(f"{sizes[0][0]} x {sizes[0][1]} pixels" + (" and other sizes" if len(sizes) > 1 else ""))
     budgets = sorted(set(numbers(frames, "budget")))
     if budgets:
-        said.append(
-            f"a budget of {' to '.join(f'{each:,}' for each in dict.fromkeys([budgets[0], budgets[-1]]))} splats"
-        )
+        ends = " to ".join(f"{each:,}" for each in dict.fromkeys([budgets[0], budgets[-1]]))
+        said.append(f"a budget of {ends} splats")
     return ", ".join(said)
 
 
 def draw_charts(rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.uint8]:
-    """(H, WIDTH, 3) the charts of a path, of at least one frame; a column without a number has none.
+    """Draw the charts of a path, of at least one frame, except those of empty columns; return (H, WIDTH, 3) pixels.
 
     `marked` are numbers of notable frames by criterion (`Panel.marks`).
     """
@@ -434,21 +421,10 @@ def draw_charts(rows: Sequence[Row], marked: Mapping[str, int]) -> NDArray[np.ui
                 at = places[number]
                 axes.axvline(frames.x[at], color=PINK, alpha=0.28, linewidth=0.9)
                 if reason in panel.marks:
-                    _mark(axes, number, frames.x[at], heights[at], at > 0.85 * len(rows))
+                    point, text = (frames.x[at], heights[at]), f"frame {number:,}"
+                    axes.plot(*point, "o", color=PINK, markersize=6, zorder=5, clip_on=False)
+                    side, away = ("right", -8) if at > 0.85 * len(rows) else ("left", 8)
+                    look = {"color": INK, "fontsize": 9.5, "ha": side, "va": "bottom", "annotation_clip": False}
+                    axes.annotate(text, point, (away, 3), textcoords="offset points", **look)
 
     return draw(max(1, -(-len(panels) // 2)), ROW, fill)
-
-
-def _mark(axes: Axes, number: int, x: float, y: float, left: bool) -> None:
-    axes.plot([x], [y], "o", color=PINK, markersize=6, zorder=5, clip_on=False)
-    axes.annotate(
-        f"frame {number:,}",
-        (x, y),
-        (-8 if left else 8, 3),
-        textcoords="offset points",
-        color=INK,
-        fontsize=9.5,
-        ha="right" if left else "left",
-        va="bottom",
-        annotation_clip=False,
-    )

@@ -14,32 +14,32 @@ from ..system.errors import SparklodError
 #: (H, W, C), 0..1.
 Image = NDArray[np.floating[Any]]
 
-#: (H, W), which pixels count.
+#: (H, W): True for each pixel that counts.
 Mask = NDArray[np.bool_]
 
-#: Grays that pictures are compared on, by name.
+#: Gray backgrounds on which pictures are compared, by name.
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
 
-#: Largest PSNR, dB, which identical images get: theirs is infinite, and tables, means and assertions need a number. It
-#: is far above the 59 dB of an image rounded to 8 bits.
+#: Largest PSNR in dB. Identical images have it instead of infinity, because tables, means and assertions need a number;
+#: an image rounded to 8 bits has 59 dB.
 MOST_PSNR = 100.0
 
 #: Side of a tile, pixels.
 TILE = 64
 
-#: SSIM as Wang, Bovik, Sheikh and Simoncelli defined it in 2004: standard deviation and width in pixels of its Gaussian
-#: window, and the constants that stabilize the division in dark and flat places, for images of 0..1.
+#: SSIM as defined by Wang, Bovik, Sheikh and Simoncelli in 2004: standard deviation and width in pixels of its Gaussian
+#: window, and the constants that stabilize the division in dark and flat regions of images of 0..1.
 SIGMA, WINDOW, C1, C2 = 1.5, 11, 0.01**2, 0.03**2
 
-#: Weights of red, green and blue in the luminance that edges are found in: those of Rec. 709.
+#: Weights of red, green and blue in luminance, from Rec. 709.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
-#: Scharr's operator: a difference along one axis, smoothed by these weights along the other, which makes its length
-#: nearly the same in all directions. So scaled, a ramp that rises by g a pixel has the gradient g.
+#: Weights of Scharr's operator, a difference along one axis smoothed along the other; its length hardly depends on the
+#: direction. Normalized: a ramp that rises by g per pixel has the gradient g.
 SCHARR = (3 / 32, 10 / 32, 3 / 32)
 
-#: Least gradient of an edge, luminance a pixel. A step has half of its height on either side, so steps of a fifth of
-#: the range from black to white are edges; shades and soft textures are not.
+#: Least gradient of an edge, luminance per pixel. The operator sees half of the height of a step on each side, so steps
+#: of a fifth of the range from black to white are edges; shades and soft textures are not.
 EDGE = 0.1
 
 #: Rows that are smoothed at a time, few enough for the processor's cache.
@@ -48,7 +48,7 @@ STRIP = 32
 
 @dataclass(frozen=True)
 class Tile:
-    """One tile of an image: its PSNR in dB, and its upper left pixel."""
+    """Position of a tile's upper left pixel, and its PSNR in dB."""
 
     psnr: float
     x: int
@@ -56,9 +56,9 @@ class Tile:
 
 
 def check_covered(reference: Image, subject: str) -> None:
-    """Raise a `SparklodError` if a reference, (H, W, 4), is empty: figures of a comparison would mean nothing.
+    """Raise a `SparklodError` if a reference, (H, W, 4), is empty, which would make a comparison meaningless.
 
-    `subject` is what the picture shows, for the error.
+    `subject` names the reference in the error.
     """
     if not (reference[..., 3] > 0).any():
         raise SparklodError(
@@ -68,47 +68,43 @@ def check_covered(reference: Image, subject: str) -> None:
 
 
 def on_background(image: Image, gray: float) -> Image:
-    """(H, W, 3), 0..1: an image with premultiplied alpha, composited over a grey background 0..1."""
+    """Composite an image with premultiplied alpha over a gray background 0..1; return (H, W, 3), clipped to 0..1."""
     return np.clip(image[..., :3] + np.float32(gray) * (1 - image[..., 3:]), 0, 1)
 
 
 def psnr_of(mse: float) -> float:
-    """PSNR in dB of a mean square error of images of 0..1; at most `MOST_PSNR`."""
+    """Return the PSNR in dB for a mean square error of images of 0..1; at most `MOST_PSNR`."""
     return min(-10 * math.log10(mse), MOST_PSNR) if mse > 0 else MOST_PSNR
 
 
 def psnr(a: Image, b: Image) -> float:
-    """Peak signal-to-noise ratio in dB, over all pixels and channels of two images of 0..1; at most `MOST_PSNR`."""
+    """Return the peak signal-to-noise ratio in dB over all pixels and channels of two images; at most `MOST_PSNR`."""
     return psnr_of(float(np.mean(_squared_error(a, b))))
 
 
 def edges(image: Image) -> Mask:
-    """(H, W) where a picture, (H, W, 4) with premultiplied alpha, has an edge, on black or on white, and around it.
+    """Find the edges of a picture, (H, W, 4) with premultiplied alpha, on each of `BACKGROUNDS`.
 
-    An edge is a pixel whose luminance has a gradient of at least `EDGE`; the pixels around it are its eight neighbours.
+    An edge is a pixel whose luminance has a gradient of at least `EDGE`; its eight neighbours count, too.
     """
-    strong = np.zeros(image.shape[:2], bool)
+    strong = np.zeros(np.add(image.shape[:2], 2), bool)
     for gray in BACKGROUNDS.values():
-        strong |= _gradient(on_background(image, gray).astype(np.float32, copy=False) @ LUMINANCE) >= EDGE
-    rows = strong.copy()
-    rows[1:] |= strong[:-1]
-    rows[:-1] |= strong[1:]
-    wide = rows.copy()
-    wide[:, 1:] |= rows[:, :-1]
-    wide[:, :-1] |= rows[:, 1:]
+        luminance = on_background(image, gray).astype(np.float32, copy=False) @ LUMINANCE
+        strong[1:-1, 1:-1] |= _gradient(luminance) >= EDGE
+    rows = strong[:-2] | strong[1:-1] | strong[2:]
+    wide: Mask = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
     return wide
 
 
 def edge_psnr(a: Image, b: Image, where: Mask) -> float | None:
-    """PSNR in dB over the pixels `where` of `edges` alone, at most `MOST_PSNR`; None where there is no such pixel."""
-    return psnr_of(float(np.mean(_squared_error(a[where], b[where])))) if where.any() else None
+    """Return the PSNR in dB over the pixels of a mask, at most `MOST_PSNR`; None if the mask is empty."""
+    return psnr(a[where], b[where]) if where.any() else None
 
 
 def popping(a: Image, b: Image, a_before: Image, b_before: Image) -> float:
-    """Root mean square of how much the error of a picture changes from frame to frame, in steps of 8 bits.
+    """Return the root mean square change of a picture's error between two frames, in steps of 8 bits.
 
-    The error is `a - b` of a frame and what it should be; its change, (a - a_before) - (b - b_before), is what changes
-    in `a` beyond what does in `b`.
+    The error of a frame is `a - b`, with `b` as the reference.
     """
     change = np.subtract(a, b, dtype=np.float64)
     change -= a_before
@@ -117,7 +113,7 @@ def popping(a: Image, b: Image, a_before: Image, b_before: Image) -> float:
 
 
 def worst_tile(a: Image, b: Image) -> Tile:
-    """Return the tile with the lowest PSNR, the first of several. Tiles at the right and lower edge may be smaller."""
+    """Return the tile with the lowest PSNR, the first of equals. Tiles at the right and lower edge may be smaller."""
     error = _squared_error(a, b).mean(axis=2)
     height, width = error.shape
     down, across = np.arange(0, height, TILE), np.arange(0, width, TILE)
@@ -129,9 +125,9 @@ def worst_tile(a: Image, b: Image) -> Tile:
 
 
 def ssim(a: Image, b: Image) -> float:
-    """Structural similarity (Wang et al. 2004), 1 for identical images: the mean over all positions of the window.
+    """Return the structural similarity (Wang et al. 2004), 1 for identical images, averaged over pixels and channels.
 
-    Each channel is compared by itself. A window wider than the image is cut to its side.
+    The window slides inside the image only; it is cut to the side of a smaller image.
     """
     taps = [_taps(min(WINDOW, side)) for side in a.shape[:2]]
     rows = a.shape[0] - len(taps[0]) + 1
@@ -145,7 +141,7 @@ def ssim(a: Image, b: Image) -> float:
 
 
 def _similarity(a: Image, b: Image, taps: list[NDArray[np.float64]]) -> Image:
-    """SSIM at each position of the window inside the image."""
+    """Return the SSIM at each position of the window inside the image."""
     mean_a, mean_b = _smoothed(a, taps), _smoothed(b, taps)
     square_a, square_b, product = mean_a * mean_a, mean_b * mean_b, mean_a * mean_b
     # Only the sum of both variances is needed.
@@ -156,14 +152,14 @@ def _similarity(a: Image, b: Image, taps: list[NDArray[np.float64]]) -> Image:
 
 
 def _taps(length: int) -> NDArray[np.float64]:
-    """(length,) weights of a Gaussian window, with sum 1."""
+    """Return (length,) weights of a Gaussian window with sum 1."""
     away = np.arange(length) - (length - 1) / 2
     taps = np.exp(-away * away / (2 * SIGMA * SIGMA))
     return taps / taps.sum()
 
 
 def _smoothed(image: Image, taps: list[NDArray[np.float64]]) -> Image:
-    """(H - taps + 1, W - taps + 1, C): the image convolved along each axis, where the window is inside."""
+    """Convolve an image along each axis, where the window is inside; return (H - taps + 1, W - taps + 1, C)."""
     for axis, weights in enumerate(taps):
         length = image.shape[axis] - len(weights) + 1
         shifted = [image[at : at + length] if axis == 0 else image[:, at : at + length] for at in range(len(weights))]
@@ -174,7 +170,7 @@ def _smoothed(image: Image, taps: list[NDArray[np.float64]]) -> Image:
 
 
 def _gradient(luminance: Image) -> Image:
-    """(H, W) length of the gradient of a picture (H, W), a pixel; beyond its borders it goes on as it ends."""
+    """Return (H, W) lengths of the gradient per pixel; the border of the picture is repeated outwards."""
     padded = np.pad(luminance, 1, mode="edge")
     first, middle, last = SCHARR
     down = first * padded[:, :-2] + middle * padded[:, 1:-1] + last * padded[:, 2:]

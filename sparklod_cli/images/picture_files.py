@@ -1,4 +1,4 @@
-"""Formats and defaults of pictures; their destination: a file, a file per frame, an animation or a contact sheet."""
+"""Formats of pictures, and their destination: a file, a file per frame, an animation or a contact sheet."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from ..system.output import check_writable
 #: Quantities by which `inspect` can colour a picture.
 PLOT_BY = ("level", "opacity", "size", "chunk")
 
-
 #: Formats of single pictures, of animations, and of contact sheets.
 STILL = ("png", "jpg", "webp", "npy")
 MOVING = ("webp", "gif", "mp4", "webm")
@@ -24,9 +23,8 @@ SUFFIXES = {"jpeg": "jpg"}
 #: Quality of JPEG, 1 to 100: losses are hardly visible.
 JPEG_QUALITY = 92
 
-#: Width and height of a thumbnail, pixels, and the pixels along each side that each of them is the mean of.
+#: Width and height of a thumbnail in pixels, and its supersampling factor.
 THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE = (512, 512), 2
-
 
 #: Formats with an alpha channel.
 WITH_ALPHA = ("png", "webp", "npy")
@@ -50,14 +48,14 @@ class PictureOutput:
     kind: str
 
     def paths(self, numbers: Sequence[int]) -> list[Path]:
-        """Return the files of the frames of these numbers; the one file if they share it, none for standard output."""
+        """Return the files of numbered frames: one file if they share it, none for standard output."""
         if self.name is None or self.kind != "frames":
             return [] if self.name is None else [self.name]
         before, place, after = re.split(f"({NUMBER.pattern})", self.name.name)
         return [self.name.with_name(f"{before}{place % number}{after}") for number in numbers]
 
     def check(self, numbers: Sequence[int], *, overwrite: bool) -> None:
-        """Raise an `OutputError` if the files of these frames exist, or no file can be written there."""
+        """Raise an `OutputError` if files of these frames exist and `overwrite` is not set, or cannot be written."""
         for path in self.paths(numbers):
             check_writable(path, overwrite=overwrite, tried=False)
         for path in self.paths([0]):
@@ -65,7 +63,7 @@ class PictureOutput:
 
 
 def output_for(name: Path | None, default: Path, cameras: int, *, sheet: bool) -> PictureOutput:
-    """Return the destination of the pictures of a number of cameras; `ValueError` if that or the name cannot be.
+    """Return the destination of the pictures of some cameras; `ValueError` if the name does not fit their number.
 
     `name` is the requested path; "-" for standard output; None for a path derived from `default`, which has no suffix.
     """

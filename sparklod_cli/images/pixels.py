@@ -1,6 +1,6 @@
-"""Images of floats to 8-bit pixels and to the bytes of pictures, .npy files and animations, and text on pictures.
+"""Conversion of float images to 8-bit pixels and encoded pictures, contact sheets and animations; text on pictures.
 
-Animations are GIF and WebP by Pillow, MP4 and WebM by imageio of the extra `video`.
+Pillow writes GIF and WebP, imageio of the extra `video` MP4 and WebM.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ if TYPE_CHECKING:
     from ..render.color_scales import Coloring
     from ..render.rasterizer import Image
 
-#: Colours of all pictures with text: the ground, titles, other text, and thin lines.
+#: Colours of pictures with text: background, titles, other text, and thin lines.
 BACKGROUND, INK, FAINT, LINE = "#0f141b", "#e6edf3", "#9aa7b4", "#7d8996"
 
-#: Characters of a title: more do not fit into the width of a picture.
+#: Most characters of a title that fit into the width of a picture.
 MAX_TITLE = 120
 
-#: Least size of letters, pixels: below it Pillow's font cannot be read.
+#: Least legible size of Pillow's font, pixels.
 MIN_LETTERS = 7
 
 Font = Any
 
 
 def font(unit: float, size: float) -> Font:
-    """Pillow's font, in a size given in thousandths of the picture's height."""
+    """Return Pillow's font in a size given in units, which are pixels."""
     return ImageFont.load_default(size=max(MIN_LETTERS, size * unit))
 
 
 def write_title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Sequence[tuple[str, str]]) -> None:
-    """Write a title, and lines below it, at the upper left of a picture.
+    """Write a title and lines of text with their colours at the upper left of a picture.
 
-    `unit` is a thousandth of the picture's height, pixels; `lines` are texts and their colours.
+    `unit` is a thousandth of the picture's height, in pixels.
     """
     left, top = 40 * unit, 30 * unit
     draw.text((left, top), printable(title, MAX_TITLE), INK, font(unit, 32))
@@ -55,7 +55,7 @@ def write_title(draw: ImageDraw.ImageDraw, unit: float, title: str, lines: Seque
 
 
 def write_scale(image: Pillow.Image, draw: ImageDraw.ImageDraw, unit: float, coloring: Coloring) -> None:
-    """Draw a colour scale at the right of a picture; `unit` is that of `write_title`."""
+    """Draw a colour scale at the right of a picture, in units as in `write_title`."""
     left, right = image.width - 170 * unit, image.width - 146 * unit
     top, bottom = 0.26 * image.height, 0.84 * image.height
     draw.text((left, top - 18 * unit), coloring.title, INK, font(unit, 21), anchor="ls")
@@ -75,18 +75,17 @@ Pixels = NDArray[np.uint8]
 #: Red, green and blue, 0..1.
 Color = tuple[float, float, float]
 
-#: Deflate level of PNG, of 1 to 9: higher ones take twice as long and save a few percent.
+#: Deflate level of PNG, 1 to 9: higher levels take twice as long and save a few percent.
 PNG_LEVEL = 4
 
-
-#: Height in pixels at which a colour scale has its full size; its smallest size, as a share of that; and width and
-#: height of the smallest picture that gets one.
+#: Height in pixels of a picture whose colour scale has its full size; the least size of a scale as a share of that; and
+#: width and height of the smallest picture with a scale.
 WHOLE_HEIGHT, LEAST_UNIT, LEAST_PICTURE = 1000, 0.62, (400, 240)
 
 #: Width of the panel with the colour scale, in pixels at `WHOLE_HEIGHT`.
 SCALE_WIDTH = 190
 
-#: Factors among which `gain_for` chooses the amplification of differences.
+#: Gains among which `gain_for` chooses.
 GAINS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
 #: Ends of the colour scale of differences.
@@ -94,7 +93,7 @@ GRAYS = ("000000", "ffffff")
 
 
 def over(image: Image, background: Color | None) -> Image:
-    """(H, W, 4) an image over a background, with alpha 1; the image itself if the background is None."""
+    """Composite an image over a background; return it with alpha 1, or unchanged if the background is None."""
     if background is None:
         return image
     through = 1 - image[..., 3:]
@@ -103,7 +102,7 @@ def over(image: Image, background: Color | None) -> Image:
 
 
 def eight_bits(image: Image) -> Pixels:
-    """(H, W, 4) 8-bit pixels of an image, colours divided by alpha; (H, W, 3) if alpha is 1 everywhere."""
+    """Divide the colours of an image by alpha and round to 8 bits; return (H, W, 3) if alpha is 1 everywhere."""
     alpha = image[..., 3:]
     values = image[..., :3]
     if not (alpha == 1).all():
@@ -114,13 +113,13 @@ def eight_bits(image: Image) -> Pixels:
 
 
 def difference(a: Image, b: Image, gain: float) -> Image:
-    """(H, W, 4) absolute differences of two images of alpha 1, channel by channel, multiplied by `gain`."""
+    """Return an image of alpha 1 with the absolute differences of two images, multiplied by `gain`."""
     amplified = np.clip(gain * apart(a, b), 0, 1)
     return np.concatenate([amplified, np.ones_like(a[..., 3:])], axis=2).astype(np.float32)
 
 
 def scale_width(width: int, height: int) -> int:
-    """Pixels that a colour scale adds to the width of a picture; 0 for a picture that is too small for one."""
+    """Return the pixels that a colour scale adds to the width of a picture; 0 if the picture is too small for one."""
     if width < LEAST_PICTURE[0] or height < LEAST_PICTURE[1]:
         return 0
     return round(SCALE_WIDTH * _unit(width, height))
@@ -131,7 +130,7 @@ def _unit(width: int, height: int) -> float:
 
 
 def with_scale(pixels: Pixels, bar: Coloring) -> Pixels:
-    """Return a picture with a colour scale on its right; a picture that is too small for one is returned unchanged."""
+    """Add a colour scale at the right of a picture; return a picture that is too small for one unchanged."""
     height, width = pixels.shape[:2]
     wider = scale_width(width, height)
     if not wider:
@@ -144,14 +143,14 @@ def with_scale(pixels: Pixels, bar: Coloring) -> Pixels:
 
 
 def apart(a: Image, b: Image) -> Image:
-    """(H, W, 3) absolute differences of two images of alpha 1, channel by channel, 0..1."""
+    """Return (H, W, 3) absolute differences of two images of alpha 1, 0..1."""
     return np.abs(np.clip(a[..., :3], 0, 1) - np.clip(b[..., :3], 0, 1))
 
 
 def gain_for(differences: Sequence[Image]) -> float:
-    """Return the amplification with which differences, (H, W, 3) each, are visible and few of them are clipped.
+    """Return the largest of `GAINS` that clips at most 1 % of the differing pixels; 1 if no pixel differs.
 
-    It is the largest of `GAINS` with which 99 % of the pixels that differ are not clipped; 1 if no pixel differs.
+    `differences` are arrays of `apart`.
     """
     largest = np.concatenate([each.max(axis=2).ravel() for each in differences])
     differing = largest[largest > 0]
@@ -162,7 +161,7 @@ def gain_for(differences: Sequence[Image]) -> float:
 
 
 def difference_bar(gain: float) -> Coloring:
-    """Return the colour scale of `difference`: absolute difference of a channel, 0..1."""
+    """Return the colour scale of an image of `difference`."""
     from ..render.color_scales import smooth  # most pictures have no scale
 
     marks = [(0.0, "0"), (0.5, f"{0.5 / gain:.3g}"), (1.0, f"{1 / gain:.3g}" + " or more" * (gain > 1))]
@@ -170,7 +169,7 @@ def difference_bar(gain: float) -> Coloring:
 
 
 def encode(pixels: Pixels, form: str, jpeg_quality: int = JPEG_QUALITY) -> bytes:
-    """Return the bytes of a "png" or, without loss, of a "webp", which may have alpha, or of a "jpg"."""
+    """Encode a picture as "png", lossless "webp" or, without alpha, "jpg"."""
     out = io.BytesIO()
     picture = Pillow.fromarray(pixels)
     if form == "jpg":
@@ -183,21 +182,22 @@ def encode(pixels: Pixels, form: str, jpeg_quality: int = JPEG_QUALITY) -> bytes
 
 
 def encode_floats(values: NDArray[np.float32]) -> bytes:
-    """Return the bytes of a .npy file."""
+    """Encode an array as .npy."""
     out = io.BytesIO()
     np.save(out, values)
     return out.getvalue()
 
 
-#: Pixels between and around the pictures; height of a caption and of its letters below a picture 720 pixels high.
+#: Pixels between and around the pictures of a sheet; height of a caption and of its letters below a picture 720 pixels
+#: high.
 GAP, CAPTION, LETTERS = 8, 34, 20
 
-#: Width over height that a sheet comes close to: that of most screens.
+#: Width over height that a sheet approximates, of most screens.
 ASPECT = 1.6
 
 
 def grid(count: int, size: tuple[int, int]) -> tuple[int, int]:
-    """Columns and rows for `count` pictures of a size: the grid without an empty row that is closest to `ASPECT`."""
+    """Return columns and rows for pictures of a size: the grid without an empty row that is closest to `ASPECT`."""
     shapes = [(columns, math.ceil(count / columns)) for columns in range(1, count + 1)]
     return min(shapes, key=lambda shape: abs(math.log(shape[0] * size[0] / (shape[1] * size[1]) / ASPECT)))
 
@@ -210,9 +210,9 @@ def cells(count: int, size: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def sheet(pictures: Sequence[Pixels], captions: Sequence[str]) -> Pixels:
-    """Return one picture of several of the same size, at least one, which are not scaled.
+    """Arrange pictures of one size, at least one, on a sheet, with captions cut to the width of a picture.
 
-    The sheet has alpha if any of them has. Captions are cut to the width of a picture.
+    The sheet has alpha if any picture has.
     """
     height, width = pictures[0].shape[:2]
     size = (width, height)
@@ -237,7 +237,7 @@ def _caption_height(size: tuple[int, int]) -> int:
 
 
 def _fitting(text: str, width: int, draw: ImageDraw.ImageDraw, font: Font) -> str:
-    # No letter is narrower than a pixel, so no more can fit; measuring longer texts would take long.
+    # A letter is at least a pixel wide, so more letters cannot fit, and measuring them would take long.
     marks = text[: width + 1]
     text = "".join(mark if mark.isprintable() else "\N{REPLACEMENT CHARACTER}" for mark in marks)
 
@@ -252,19 +252,19 @@ def _fitting(text: str, width: int, draw: ImageDraw.ImageDraw, font: Font) -> st
     return cut(longest) if longest else ""
 
 
-#: Durations of the frames of a GIF: steps in ms, and the fewest steps that players do not slow down.
+#: Unit in ms of the durations in a GIF, and the fewest units that players do not slow down.
 GIF_STEP, LEAST_STEPS = 10, 2
 
-#: Longest duration of a frame, ms: 16 bits of hundredths in GIF, 24 bits of ms in WebP, ffmpeg's limit for videos.
+#: Longest duration of a frame in ms: 16 bits of hundredths in GIF, 24 bits of ms in WebP, ffmpeg's limit for videos.
 LONGEST_FRAME = {"gif": GIF_STEP * 0xFFFF, "webp": 0xFFFFFF, "mp4": 1_000_000, "webm": 1_000_000}
 
 #: Quality of WebP (0 to 100), rate factors of H.264 (51 to 0) and VP9 (63 to 0): losses are hardly visible.
 WEBP_QUALITY, H264_QUALITY, VP9_QUALITY = 90, 16, 24
 
-#: Flag of a WebP that it has alpha. libwebp omits it where only cropped edges are transparent.
+#: Flag for alpha in a WebP header. libwebp omits it where only cropped edges are transparent.
 WEBP_ALPHA = 0x10
 
-#: Codec and options of ffmpeg for each kind of video. VP9 obeys its rate factor only with a bit rate of 0, and uses
+#: Codec and options of ffmpeg for each kind of video. VP9 honours its rate factor only with a bit rate of 0, and uses
 #: several processors only with -row-mt.
 VIDEOS = {
     "mp4": ("libx264", ["-crf", str(H264_QUALITY), "-preset", "medium", "-movflags", "+faststart"]),
@@ -276,7 +276,7 @@ VIDEOS = {
 
 
 def check_animation(form: str, fps: float) -> None:
-    """Raise a `SparklodError` if an animation cannot be written; called before any frame is drawn."""
+    """Raise a `SparklodError`, before any frame is drawn, if an animation cannot be written."""
     if form in VIDEOS:
         load_imageio(form)
     longest = LONGEST_FRAME[form] / 1000
@@ -285,7 +285,7 @@ def check_animation(form: str, fps: float) -> None:
 
 
 def load_imageio(form: str) -> ModuleType:
-    """Import imageio with its ffmpeg, which writes videos of a form; `SparklodError` if it is not installed."""
+    """Import imageio, and check that its ffmpeg is installed; `SparklodError` for the video format if it is not."""
     with optional_import(f".{form} needs imageio", "video"):
         import imageio.v2
         import imageio_ffmpeg
@@ -299,25 +299,29 @@ def load_imageio(form: str) -> ModuleType:
 
 
 def animate(frames: Iterable[Pixels], count: int, form: str, fps: float) -> bytes:
-    """Return the bytes of an animation in an endless loop ("gif", "webp") or of a video ("mp4", "webm").
+    """Encode an endlessly looping animation ("gif", "webp") or a video ("mp4", "webm").
 
-    Frames, all of one size, with alpha for "webp" only, are taken as they are encoded; a GIF's are held, a byte a
-    pixel, until the last. `SparklodError` if videos cannot be written here, or the animation is too large for its
-    format.
+    Consumes frames while it encodes; of a GIF it keeps a byte per pixel of each.
+
+    Args:
+        frames: `count` pictures of one size, with alpha for "webp" only.
+        fps: frames per second.
+
+    Raises:
+        SparklodError: imageio is not installed, ffmpeg fails, or the animation is too large for its format.
     """
     out = io.BytesIO()
     if form in VIDEOS:
         _write_video(out, frames, form, fps)
         return out.getvalue()
-    step, least = (GIF_STEP, LEAST_STEPS) if form == "gif" else (1, 1)
-    times = _times(fps, count, step, least)
+    times = _times(fps, count, *((GIF_STEP, LEAST_STEPS) if form == "gif" else (1, 1)))
     try:
         if form == "gif":
             palette = Pillow.Palette.ADAPTIVE
             pictures = (Pillow.fromarray(frame).convert("P", palette=palette, colors=256) for frame in frames)
             next(pictures).save(out, "GIF", save_all=True, append_images=pictures, duration=times, loop=0)
         else:
-            film = _film(frames, count)
+            film = _lazy_film(frames, count)
             film.save(out, "WEBP", save_all=True, duration=times, loop=0, quality=WEBP_QUALITY, method=4)
     except (OSError, OverflowError, struct.error) as error:
         raise SparklodError(f"the .{form} cannot be written, write .mp4 or fewer frames: {error}") from None
@@ -327,8 +331,8 @@ def animate(frames: Iterable[Pixels], count: int, form: str, fps: float) -> byte
     return bytes(data)
 
 
-def _film(frames: Iterable[Pixels], count: int) -> Pillow.Image:
-    """Return a picture whose frames are drawn as Pillow seeks them, so that they are not all in memory."""
+def _lazy_film(frames: Iterable[Pixels], count: int) -> Pillow.Image:
+    """Return a picture that takes the next frame when Pillow seeks it, so that only one frame is in memory."""
     pictures = (Pillow.fromarray(frame) for frame in frames)
     film = next(pictures).copy()
 
@@ -341,7 +345,7 @@ def _film(frames: Iterable[Pixels], count: int) -> Pillow.Image:
 
 
 def _times(fps: float, count: int, step: int, least: int) -> list[int]:
-    """Durations of the frames in ms, in whole steps whose sum does not drift from the true time."""
+    """Return durations of the frames in ms, in whole steps whose sum does not drift from the true time."""
     times, elapsed = [], 0
     for number in range(1, count + 1):
         end = max(round(1000 * number / (fps * step)), elapsed + least)
@@ -358,8 +362,7 @@ def _write_video(out: io.BytesIO, frames: Iterable[Pixels], form: str, fps: floa
         for frame in frames:
             # yuv420p has colours for every second pixel, so odd sides get their last row or column twice.
             odd = [(0, side % 2) for side in frame.shape[:2]]
-            even = np.pad(frame, (*odd, (0, 0)), mode="edge")
             try:
-                writer.append_data(even)
+                writer.append_data(np.pad(frame, (*odd, (0, 0)), mode="edge"))
             except OSError as error:  # its text is the whole log of ffmpeg
                 raise SparklodError(f"ffmpeg cannot write it: {str(error).strip().splitlines()[-1]}") from None

@@ -1,7 +1,8 @@
-"""Pictures of splats, points and lines by pyvista, with title, scale and axes. The only module that imports pyvista."""
+"""Pictures of splats, points and lines by pyvista, with title, scale and axes. Only this module imports pyvista."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
 import math
@@ -10,8 +11,8 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
-from types import ModuleType, TracebackType
+from itertools import combinations, product
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -29,28 +30,21 @@ from .pixels import FAINT, INK, LINE, font, write_scale, write_title
 #: (N, 3) points, or pairs of ends of lines; (3,) for a single point.
 Points = NDArray[np.floating[Any]]
 
-#: The corners of the unit cube, and the pairs of corners that its twelve edges join.
-CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float64)
-EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)])
+#: (T, 3) indices of the points of triangles.
+Triangles = NDArray[np.int64]
+
+#: Corners of the unit cube, and pairs of them that its twelve edges join.
+CORNERS = np.array(list(product((0, 1), repeat=3)), np.float64)
+EDGES = np.array([(a, b) for a, b in combinations(range(8), 2) if (a ^ b) in (1, 2, 4)])
 
 
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles: (P, 3) points, (P, 3) unit normals, and (T, 3) indices of points."""
-
-    points: FloatArray
-    normals: FloatArray
-    triangles: NDArray[np.int64]
-
-
-def sphere(rounds: int) -> Mesh:
-    """Return the unit sphere: an icosahedron, each of whose triangles is split into four `rounds` times."""
+def sphere(rounds: int) -> tuple[FloatArray, Triangles]:
+    """Return (P, 3) points and triangles of a unit sphere: an icosahedron, `rounds` times split into fourths."""
     golden = (1 + math.sqrt(5)) / 2
     one = np.array([[-1, golden, 0], [1, golden, 0], [-1, -golden, 0], [1, -golden, 0]])
     points = np.concatenate([one, np.roll(one, 1, axis=1), np.roll(one, 2, axis=1)])
     near = np.linalg.norm(points[:, None] - points[None], axis=2) < 2.1  # the edges are 2 long
-    found = [(a, b, c) for a, b, c in combinations(range(12), 3) if near[a, b] and near[b, c] and near[a, c]]
-    triangles = np.array(found)
+    triangles = np.array([(a, b, c) for a, b, c in combinations(range(12), 3) if near[a, b] & near[b, c] & near[a, c]])
     for _ in range(rounds):
         sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         pairs, at = np.unique(sides, axis=0, return_inverse=True)
@@ -64,31 +58,34 @@ def sphere(rounds: int) -> Mesh:
     p, q, r = unit[triangles].transpose(1, 0, 2)
     inward = np.einsum("ij,ij->i", np.cross(q - p, r - p), p) < 0
     triangles[inward] = triangles[inward][:, ::-1]
-    return Mesh(unit.astype(np.float32), unit.astype(np.float32), triangles)
+    return unit.astype(np.float32), triangles
 
 
 def rotation(quat_xyzw: FloatArray) -> FloatArray:
-    """(N, 4) unit quaternions to (N, 3, 3) float32 rotations: splat, world axis, local axis."""
+    """Convert (N, 4) unit quaternions to (N, 3, 3) float32 rotations: splat, world axis, local axis."""
     return np.stack(rotation_matrix(*quat_xyzw.T), axis=1).reshape(-1, 3, 3)
 
 
-def ellipsoids(splats: Splats, deviations: float, of: Mesh, thinnest: float) -> Mesh:
-    """Return the surfaces of N splats at some number of standard deviations, in their order.
+def ellipsoids(
+    splats: Splats, deviations: float, ball: tuple[FloatArray, Triangles], thinnest: float
+) -> tuple[FloatArray, FloatArray, Triangles]:
+    """Return points, unit normals and triangles of the surfaces of splats at a number of standard deviations.
 
-    Points of the sphere are multiplied by the radii, its normals divided by them. No radius is below `thinnest`, world
-    units, so that no splat falls between pixels.
+    Points of the unit sphere `ball` are multiplied by the radii, its normals divided by them. No radius is below
+    `thinnest`, in world units, so that no splat falls between pixels.
     """
+    unit, faces = ball
     axes = rotation(splats.quat_xyzw)
     radii = np.maximum(splats.scale * np.float32(deviations), np.float32(thinnest))
-    points = of.points @ (axes * radii[:, None]).transpose(0, 2, 1) + splats.center[:, None]
-    normals = of.points @ (axes * (radii.min(axis=1, keepdims=True) / radii)[:, None]).transpose(0, 2, 1)
+    points = unit @ (axes * radii[:, None]).transpose(0, 2, 1) + splats.center[:, None]
+    normals = unit @ (axes * (radii.min(axis=1, keepdims=True) / radii)[:, None]).transpose(0, 2, 1)
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    triangles = of.triangles + len(of.points) * np.arange(len(splats))[:, None, None]
-    return Mesh(points.reshape(-1, 3), normals.reshape(-1, 3), triangles.reshape(-1, 3))
+    triangles = faces + len(unit) * np.arange(len(splats))[:, None, None]
+    return points.reshape(-1, 3), normals.reshape(-1, 3), triangles.reshape(-1, 3)
 
 
 def evenly(count: int, most: int) -> NDArray[np.int64]:
-    """At most `most` of `count` indices, evenly spaced: the same each time, and from all parts of the file."""
+    """Return at most `most` evenly spaced indices below `count`."""
     return np.arange(count) if count <= most else np.arange(most) * count // most
 
 
@@ -98,12 +95,12 @@ def level_of_step(size: float) -> int:
 
 
 def cells(center: FloatArray, step: float) -> Points:
-    """(C, 3) lowest corners of the cells, with edges of `step`, that hold these (N, 3) centres."""
+    """Return the (C, 3) lowest corners of the occupied cells of a grid with edges of `step`."""
     return np.unique(np.floor(center.astype(np.float64) / step), axis=0) * step
 
 
 def box_lines(low: Points, high: Points) -> Points:
-    """(24 B, 3) ends of the edges of B boxes with the corners (B, 3) `low` and `high`."""
+    """Return the (24 B, 3) ends of the edges of B boxes with the corners (B, 3) `low` and `high`."""
     corners = low[:, None] + CORNERS * (high - low)[:, None]
     return corners[:, EDGES].reshape(-1, 3)
 
@@ -122,20 +119,19 @@ def wall_lines(low: Points, high: Points, far: Points, spacing: float) -> Points
     return np.concatenate(lines)
 
 
-#: Outlying splats are shown too if they lie within this share of the extent of the others.
+#: Outliers are shown, too, if they lie within this share of the extent of the other splats.
 NEAR = 0.35
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A perspective viewpoint of a figure; paths are made of `camera.Camera`s.
+    """A perspective viewpoint of a figure, as opposed to a `camera.Camera` of a path.
 
     Attributes:
-        position, target: (3,) world units.
         axes: (3, 3), in rows: right, up, and into the picture.
         angle: vertical field of view, degrees.
         aspect: width over height.
-        shift: (2,) place of `target` in the picture: -1 left or bottom, 0 middle, 1 right or top.
+        shift: (2,) position of `target` in the picture: -1 left or bottom, 0 middle, 1 right or top.
     """
 
     position: Points
@@ -146,7 +142,7 @@ class Viewpoint:
     shift: Points
 
     def project(self, points: Points) -> Points:
-        """(N, 3) points to (N, 2) places in the picture, 0..1 from the left and from the top."""
+        """Project (N, 3) points to (N, 2) positions in the picture, 0..1 from the left and from the top."""
         local = (np.asarray(points, np.float64) - self.position) @ self.axes.T
         return (1 + (_seen(local, self.angle, self.aspect) + self.shift) * (1, -1)) / 2
 
@@ -154,9 +150,9 @@ class Viewpoint:
 def viewpoint(
     points: Points, direction: Points, up: Points, *, aspect: float, frame: tuple[float, float, float, float]
 ) -> Viewpoint:
-    """Return the viewpoint that looks along a direction and just fits all points into a frame.
+    """Return the viewpoint along a direction whose picture just fits all points into a frame.
 
-    `frame` is its left, top, right and bottom in the picture, 0..1 from the left and from the top.
+    `frame` is left, top, right and bottom in the picture, 0..1 from the left and from the top.
     """
     angle = 25.0
     forward = direction / np.linalg.norm(direction)
@@ -179,21 +175,21 @@ def viewpoint(
 
 
 def _seen(local: Points, angle: float, aspect: float) -> Points:
-    """(N, 3) points in the axes of a viewpoint to (N, 2) places, -1..1 from the left and from the bottom."""
+    """Project (N, 3) points in the axes of a viewpoint to (N, 2) positions, -1..1 from the left and the bottom."""
     half = math.tan(math.radians(angle) / 2)
     return local[:, :2] / (local[:, 2:] * (half * aspect, half))
 
 
 def is_drawable(splats: Splats) -> NDArray[np.bool_]:
-    """(N,) whether each splat is valid and has a size."""
+    """Return an (N,) mask of the splats that are valid and have a size."""
     drawable: NDArray[np.bool_] = splats.is_valid() & (splats.scale.max(axis=1) > 0)
     return drawable
 
 
 def bounds(splats: Splats) -> tuple[Points, Points]:
-    """Lowest and highest corner, (3,) each, of the box that a picture of drawable splats, at least one, shows.
+    """Return the lowest and highest corner, (3,) each, of the visible box around drawable splats, at least one.
 
-    Along each axis it spans the 1 % to the 99 % quantile of the splats, or all of them if the rest are within `NEAR`.
+    Along each axis it spans the 1 % to the 99 % quantile, or all splats if the rest are within `NEAR`.
     """
     reach = splats.scale.max(axis=1).astype(np.float64)
     ends = np.empty((4, 3))
@@ -209,7 +205,7 @@ def bounds(splats: Splats) -> tuple[Points, Points]:
     return low - margin, high + margin
 
 
-#: Smallest distance between the labels of an axis, in thousandths of the picture's height.
+#: Least distance between the labels of an axis, in thousandths of the picture's height.
 LABEL_DISTANCE = 62
 
 
@@ -222,7 +218,7 @@ def write_png(
     low: Points,
     high: Points,
 ) -> bytes:
-    """Return the PNG of a picture, (H, W, 3), with title, colour scale, and axes along the edges of a box."""
+    """Add a title, a colour scale, and axes along the edges of a box to a picture, (H, W, 3); return the PNG."""
     image = Image.fromarray(pixels)
     draw = ImageDraw.Draw(image)
     unit = min(image.height / 1000, image.width / 1600)
@@ -245,7 +241,7 @@ def _axes(
     near = np.where(eye.position > (low + high) / 2, high, low)
     near[upright] = ground
     middle = eye.project(((low + high) / 2)[None])[0] * size
-    floor = np.array([[x, y, z] for x in ends[:, 0] for y in ends[:, 1] for z in ends[:, 2]])
+    floor = np.array(list(product(*ends.T)))
     floor = floor[floor[:, upright] == ground]
     left = floor[np.argmin(eye.project(floor)[:, 0])]
     for axis in range(3):
@@ -270,17 +266,17 @@ def _axes(
             draw.text(tuple(at + 24 * unit * out), text, FAINT, font(unit, 17), anchor="mm")
         name = "xyz"[axis]
         place = (first + last) / 2 + 62 * unit * out
-        if axis == upright:  # the name lies beyond its upper end
+        if axis == upright:  # with its name beyond its upper end
             name += ", down" if down else ""
             place = first - 26 * unit * along if down else last + 26 * unit * along
         draw.text(tuple(place), name, INK, font(unit, 20), anchor="mm")
 
 
-#: Most splats that are drawn as ellipsoids, and most times that their areas may cover the picture: more takes minutes.
+#: Most splats that are drawn as ellipsoids, and most times that these may cover the picture: more takes minutes.
 #: Beyond either, splats are drawn as points.
 MOST_ELLIPSOIDS, MOST_OVERDRAW = 80_000, 150
 
-#: Most triangles of all ellipsoids together: the fewer the ellipsoids, the rounder they are.
+#: Most triangles of all ellipsoids together: fewer ellipsoids are rounder.
 MOST_TRIANGLES = 1_700_000
 
 #: Radii of the ellipsoids, in standard deviations.
@@ -289,13 +285,13 @@ DEVIATIONS = 1
 #: Diameters of points, pixels.
 POINT_PIXELS = np.array([2.0, 3.0, 4.0, 6.0])
 
-#: Samples along each side of a pixel, of which it is the mean: smooths edges and keeps lines thinner than a pixel.
+#: Samples along each side of a pixel: smooths edges and keeps lines thinner than a pixel.
 OVERSAMPLING = 2
 
 #: Coordinates are clipped to this many times the extent of the scene.
 FARTHEST = 1e6
 
-#: Program that draws 8 x 8 pixels, run in its own process, because VTK ends the process where OpenGL is missing.
+#: Program that draws 8 x 8 pixels, in its own process because VTK ends the process if OpenGL is missing.
 PROBE = """
 import vtkmodules.vtkRenderingOpenGL2
 from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow
@@ -309,7 +305,7 @@ window.Render()
 
 @functools.cache
 def load_pyvista() -> ModuleType:
-    """Import pyvista, after a check that it can draw here; `SparklodError` if it is missing, or OpenGL is."""
+    """Import pyvista and check that it can draw here; `SparklodError` if pyvista or OpenGL is missing."""
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         # Without this VTK warns, and falls back to EGL only where the libraries of X are installed.
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
@@ -325,10 +321,10 @@ def load_pyvista() -> ModuleType:
     return pyvista
 
 
-class PyvistaStage:
-    """A scene to render, in units of its extent and around its middle, so that float32 suffices wherever it lies.
+class PyvistaStage(contextlib.AbstractContextManager["PyvistaStage"]):
+    """A scene to render, with its centre and extent as origin and unit, so that float32 suffices far from the origin.
 
-    A context manager: it frees pyvista's memory at the end.
+    Leaving the context frees pyvista's memory.
     """
 
     def __init__(self, low: Points, high: Points, size: tuple[int, int], background: str) -> None:
@@ -338,14 +334,11 @@ class PyvistaStage:
         self._plotter = self._pyvista.Plotter(off_screen=True, window_size=window, lighting="light kit")
         self._plotter.set_background(background)
 
-    def __enter__(self) -> PyvistaStage:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self._plotter.close()
 
     def splats(self, splats: Splats, rgb: NDArray[np.uint8], eye: Viewpoint) -> str:
-        """Add N splats in (N, 3) colours, as ellipsoids or, if they are too many, as points; return a description."""
+        """Add splats in (N, 3) colours, as ellipsoids or, if there are too many, as points; return a description."""
         away = (splats.center - eye.position) @ eye.axes[2]
         half = math.tan(math.radians(eye.angle) / 2)
         pixels = splats.scale.mean(axis=1) / np.maximum(away, 1e-3 * self._unit) * self._size[1] / half
@@ -355,11 +348,12 @@ class PyvistaStage:
             return f"points of the splats' size, {POINT_PIXELS[0]:g} to {POINT_PIXELS[-1]:g} pixels"
         # From front to back, so that hidden surfaces cost little.
         order = np.argsort(away - splats.scale.max(axis=1), kind="stable")
-        of = sphere(next(n for n in (3, 2, 1, 0) if n == 0 or len(splats) * 20 * 4**n <= MOST_TRIANGLES))
-        shape = ellipsoids(splats.take(order), DEVIATIONS, of, thinnest=0.7 * self._unit / self._size[1])
-        mesh = self._pyvista.PolyData.from_regular_faces(self._local(shape.points), shape.triangles)
-        colors = np.repeat(rgb[order], len(of.points), axis=0)
-        self._add(mesh, shape.normals, colors, ambient=0.45, diffuse=0.65, specular=0.15, culling="back")
+        ball = sphere(next(n for n in (3, 2, 1, 0) if n == 0 or len(splats) * 20 * 4**n <= MOST_TRIANGLES))
+        thinnest = 0.7 * self._unit / self._size[1]
+        points, normals, triangles = ellipsoids(splats.take(order), DEVIATIONS, ball, thinnest)
+        mesh = self._pyvista.PolyData.from_regular_faces(self._local(points), triangles)
+        colors = np.repeat(rgb[order], len(ball[0]), axis=0)
+        self._add(mesh, normals, colors, ambient=0.45, diffuse=0.65, specular=0.15, culling="back")
         return f"ellipsoids at {DEVIATIONS:g} standard deviation"
 
     def _points(self, splats: Splats, rgb: NDArray[np.uint8], pixels: FloatArray) -> None:
@@ -399,7 +393,7 @@ class PyvistaStage:
         camera.position, camera.focal_point = self._local(eye.position), self._local(eye.target)
         camera.up, camera.view_angle = eye.axes[1], eye.angle
         camera.SetWindowCenter(*-eye.shift)
-        # VTK would choose the range by the farthest splat, and its near plane would then cut the scene.
+        # VTK would choose the range by the farthest splat; its near plane would then cut the scene.
         distance = float(np.linalg.norm(eye.target - eye.position)) / self._unit
         camera.clipping_range = (0.05 * distance, 20 * distance)
         pixels = self._plotter.screenshot(None, return_img=True)

@@ -1,7 +1,4 @@
-"""Pictures by pyvista of a scene, of the nodes at one depth of a tree, and of a camera path.
-
-Those of scenes and trees show the voxel grid, boxes of the chunks, and axes.
-"""
+"""Pictures by pyvista: a scene or one depth of a tree, with voxel grid and boxes of chunks; a camera path."""
 
 from __future__ import annotations
 
@@ -48,7 +45,7 @@ from .pyvista_scene import (
     write_png,
 )
 
-#: Marks closer to an end of a scale than this share of it are left out: they would touch the mark of the end.
+#: Least distance of a mark from the ends of a scale, as a share of it; nearer labels would touch.
 APART = 0.04
 
 
@@ -58,15 +55,14 @@ def color_by(
     """Return a colour scale for M of N splats, and their (M, 3) colours.
 
     Args:
-        by: one of `PLOT_BY`: "level", the depth of a node, needs `depth`; else "opacity", "size" or "chunk".
-        index: (M,) indices of the splats that are coloured; at least one.
-        depth: (N,) edges from the root; None for a scene without a tree.
+        by: one of `PLOT_BY`; "level" needs `depth`.
+        index: (M,) indices of the splats to colour; at least one.
+        depth: (N,) edges from the root.
     """
     values: NDArray[Any]
     if by == "level" and depth is not None:
         values = depth[index]
-        # One depth alone: its colour says how far down the tree it lies.
-        one = values.min() == values.max()
+        one = values.min() == values.max()  # its colour then shows how deep in the tree it lies
         scale = whole_numbers("tree depth", 0, int(depth.max())) if one else depth_scale("tree depth", values)
     elif by == "chunk":
         values = index // CHUNK_NODES
@@ -80,7 +76,7 @@ def color_by(
     return scale, scale.rgb(values)
 
 
-#: Most nodes that are drawn; of more, an even sample.
+#: Most nodes that are drawn; more are sampled evenly.
 MOST_POINTS = 600_000
 
 #: Most occupied voxels that are outlined one by one, and most lines of the voxel grid along an axis.
@@ -89,13 +85,13 @@ MOST_CELLS, MOST_LINES = 150, 48
 #: Most chunks whose boxes are drawn.
 MOST_CHUNKS = 16
 
-#: Viewing direction, from the back, the right and above: how far it goes to the right, up, and to the front.
+#: Viewing direction, from the back, the right and above: components to the right, up, and to the front.
 DIRECTION = -0.62, -0.5, 1.0
 
-#: Left, top, right and bottom of the scene in the picture, 0..1; title, labels and colour scale are around it.
+#: Left, top, right and bottom of the scene in the picture, 0..1; title, labels and colour scale surround it.
 FRAME = (0.09, 0.2, 0.85, 0.93)
 
-#: Colours of leaves above the depth that is drawn, of the voxel grid, and of the chunks' boxes.
+#: Colours of leaves above the chosen depth, of the voxel grid, and of the boxes of chunks.
 GREY, VOXELS, BOXES = "#5b6673", "#6ea8fe", "#dfe7ef"
 
 
@@ -107,20 +103,19 @@ class DescribedPicture:
     description: str
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of numbers that are out of range in the file
+@np.errstate(over="ignore", invalid="ignore")  # for numbers out of range in the file
 def plot(
     scene: Scene, *, by: str = "level", depth: int | None = None, size: tuple[int, int] = (1600, 1000)
 ) -> DescribedPicture:
-    """Draw a scene. All depths of a tree are seen from the same viewpoint.
+    """Draw the valid splats of a scene. All depths of a tree have the same viewpoint.
 
     Args:
-        scene: N splats; invalid ones are left out. Its tree may be broken.
-        by: one of `PLOT_BY`; for a scene without a tree, "level" means "size".
-        depth: edges from the root to the nodes that are drawn; None for all leaves, or all splats.
+        scene: may have a broken tree.
+        by: one of `PLOT_BY`; without a tree, "level" means "size".
+        depth: edges from the root to the nodes to draw; None for all leaves, or all splats.
 
     Raises:
-        SparklodError: pyvista is not installed or cannot draw here, no node has this depth, or there is nothing to
-            draw.
+        SparklodError: pyvista is not installed or cannot draw here, or there is no splat to draw.
     """
     if by not in PLOT_BY:
         raise ValueError(f"by is {by}, not one of {', '.join(PLOT_BY)}")
@@ -156,36 +151,37 @@ def plot(
 def _subject(
     scene: Scene, depth: int | None, drawable: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32] | None, str]:
-    """Return the splats in colour, leaves above the depth that is drawn, the depth of each node, and a title.
+    """Choose the splats to draw.
 
-    Depths are (N,), -1 for a node that the root does not lead to; None without a tree.
+    Returns:
+        Indices of the splats in colour, and of leaves above the chosen depth; (N,) depths, -1 for nodes unreachable
+        from the root, None without a tree; a title.
     """
-    none = np.empty(0, np.int64)
+    others = np.empty(0, np.int64)
     if scene.tree is None:
         if depth is not None:
             raise SparklodError("it has no depths to draw: it is not a Level-of-Detail tree")
-        index, others, depths = np.flatnonzero(drawable), none, None
-        title = count_of(len(index), "splat")
+        index = np.flatnonzero(drawable)
+        return index, others, None, count_of(len(index), "splat")
+    depths = find_depths(scene.tree.child_count, scene.tree.child_start, spark_size(scene.splats))[0]
+    leaf = scene.tree.is_leaf & drawable & (depths >= 0)
+    if depth is None:
+        index = np.flatnonzero(leaf)
+        title = f"{count_of(len(index), 'leaf', 'leaves')} of a tree of depth {depths.max()}"
     else:
-        depths = find_depths(scene.tree.child_count, scene.tree.child_start, spark_size(scene.splats))[0]
-        leaf = scene.tree.is_leaf & drawable & (depths >= 0)
-        if depth is None:
-            index, others = np.flatnonzero(leaf), none
-            title = f"{count_of(len(index), 'leaf', 'leaves')} of a tree of depth {depths.max()}"
-        else:
-            index, others = np.flatnonzero(drawable & (depths == depth)), np.flatnonzero(leaf & (depths < depth))
-            title = f"Depth {depth} of {depths.max()}: {count_of(len(index), 'node')}"
-        if not len(index):
-            what = "leaf" if depth is None else f"node of depth {depth}"
-            raise SparklodError(f"there is no {what} to draw: the tree has depths 0 to {depths.max()}")
+        index, others = np.flatnonzero(drawable & (depths == depth)), np.flatnonzero(leaf & (depths < depth))
+        title = f"Depth {depth} of {depths.max()}: {count_of(len(index), 'node')}"
+    if not len(index):
+        what = "leaf" if depth is None else f"node of depth {depth}"
+        raise SparklodError(f"there is no {what} to draw: the tree has depths 0 to {depths.max()}")
     return index, others, depths, title
 
 
 def _voxels(stage: PyvistaStage, splats: Splats, low: Points, high: Points, eye: Points) -> str:
     """Draw the voxel grid in which Quick-LoD would merge splats of this size; return a description.
 
-    A file says neither the base of its grids nor to which of them a node belongs, so the grid is the one of the default
-    base that the median size belongs to.
+    A file stores neither the base of its grids nor the level of a node, so the grid is that of the median size with the
+    default base.
     """
     level = level_of_step(2 * float(np.median(splats.scale.max(axis=1))))
     step = DEFAULT_BASE**level
@@ -202,7 +198,7 @@ def _voxels(stage: PyvistaStage, splats: Splats, low: Points, high: Points, eye:
 
 
 def _boxes(stage: PyvistaStage, scene: Scene, index: NDArray[np.int64], drawable: NDArray[np.bool_], by: str) -> str:
-    """Draw boxes around the chunks that hold some nodes; return a description."""
+    """Draw boxes around the chunks of some nodes; return a description."""
     count = -(-len(drawable) // CHUNK_NODES)
     chunks = np.unique(index // CHUNK_NODES)
     colors = ramp(VIRIDIS, count)
@@ -216,16 +212,16 @@ def _boxes(stage: PyvistaStage, scene: Scene, index: NDArray[np.int64], drawable
     return f"boxes: the {len(chunks)} of {count} chunks of {CHUNK_NODES:,} {what} that hold these{drawn}"
 
 
-#: Most cameras whose frusta are drawn, and most cameras that the line of the path goes through.
+#: Most cameras whose frusta are drawn, and most points of the line of the path.
 MOST_FRUSTA, MOST_STEPS = 24, 5_000
 
-#: Length of a frustum as a share of the extent of what is shown, and that of the frame whose cut is drawn.
+#: Lengths of a frustum, and of that of the chosen frame, as a share of the extent of the picture's content.
 LENGTH, CHOSEN_LENGTH = 0.03, 0.075
 
 #: Colours of the path, and of the chosen frame.
 PATH, CHOSEN = "#ffffff", "#ff5c8a"
 
-#: Opacity of lines where splats hide them.
+#: Opacity of lines hidden by splats.
 BEHIND = 0.45
 
 #: `FRAME` of the picture of a path, whose title is shorter.
@@ -239,7 +235,7 @@ class PathScene:
     Attributes:
         splats: N splats of the cut of one frame.
         depth: (N,) edges from the root to each node of the cut, or the detail level of each splat.
-        frame: index of the camera whose cut is drawn, and which is marked; None for no mark.
+        frame: index of the camera to mark, to which the cut belongs; None for no mark.
         title: name of `depth`, for display.
     """
 
@@ -250,27 +246,26 @@ class PathScene:
     title: str = "tree depth"
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of numbers that are out of range in the file
+@np.errstate(over="ignore", invalid="ignore")  # for numbers out of range in the file
 def picture_of_path(scene: PathScene, *, size: tuple[int, int] = (1600, 1000)) -> bytes:
-    """Return the PNG of a path, its frusta and a cut, whose splats are left out where they are not finite.
+    """Draw a path, its frusta, and the finite splats of a cut; return the PNG.
 
-    `SparklodError` if pyvista is not installed or cannot draw here, or there is nothing to draw.
+    `SparklodError` if pyvista is not installed or cannot draw here, or no splat is finite.
     """
     cameras, splats, depth, frame = scene.cameras, scene.splats, scene.depth, scene.frame
     index = np.flatnonzero(is_drawable(splats))
     if not len(index):
         raise SparklodError("there is nothing to draw: no splat of the cut is finite and has a size")
-    drawable = splats.with_max_sh(0).take(index)
+    splats = splats.with_max_sh(0)
     chosen = index[evenly(len(index), MOST_POINTS)]
-    shown = splats.with_max_sh(0).take(chosen)
     coloring = depth_scale(scene.title, depth[chosen])
-    low, high = bounds(drawable)
+    low, high = bounds(splats.take(index))
     way = np.array([camera.position for camera in cameras])
     low, high = np.minimum(low, way.min(axis=0)), np.maximum(high, way.max(axis=0))
     eye = _above(cameras, low, high, size)
     parts = _path_lines(cameras, way, frame, float((high - low).max()))
     with PyvistaStage(low, high, size, BACKGROUND) as stage:
-        drawn = stage.splats(shown, coloring.rgb(depth[chosen]), eye)
+        drawn = stage.splats(splats.take(chosen), coloring.rgb(depth[chosen]), eye)
         for ends, color in parts:
             stage.lines(ends, color, 1.0, width=1.5)
         pixels = stage.photograph(eye)
@@ -289,7 +284,7 @@ def picture_of_path(scene: PathScene, *, size: tuple[int, int] = (1600, 1000)) -
 
 
 def _above(cameras: Sequence[Camera], low: Points, high: Points, size: tuple[int, int]) -> Viewpoint:
-    """Return a viewpoint above a corner of the box, with the mean up axis of the cameras upwards."""
+    """Return a viewpoint above a corner of a box, with the mean up axis of the cameras pointing up."""
     mean = np.sum([camera.camera_to_world[:3, 1] for camera in cameras], axis=0)
     axis = int(np.abs(mean).argmax())
     up = np.zeros(3)
@@ -309,7 +304,7 @@ def _path_lines(cameras: Sequence[Camera], way: Points, frame: int | None, exten
 
 
 def frustum_lines(camera: Camera, length: float) -> Points:
-    """(20, 3) ends of the lines of a frustum, world units: four edges, the far rectangle and a roof on its upper side.
+    """Return the (20, 3) ends of the lines of a frustum: four edges, the far rectangle and a roof on its upper side.
 
     `length` is the distance of the far rectangle along the optical axis, world units.
     """
@@ -325,7 +320,7 @@ def frustum_lines(camera: Camera, length: float) -> Points:
 
 
 def _seen_through(pixels: NDArray[np.uint8], lines: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) a picture in which hidden lines show faintly, mixed in from the same lines on an empty ground."""
+    """Blend a picture with one of the same lines on an empty background, so that hidden lines show faintly."""
     ground = np.array([int(BACKGROUND[at : at + 2], 16) for at in (1, 3, 5)], np.float32)
     covered = np.abs(lines - ground).max(axis=2, keepdims=True) / (255 - ground.min())
     share = BEHIND * np.clip(covered, 0, 1)

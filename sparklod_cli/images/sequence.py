@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,22 +15,21 @@ from ..system.output import write_file
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from ..system.threads import on_threads, ordered_map
+from . import metrics
 from . import pixels as codes
-from .picture_files import JPEG_QUALITY
-from .pixels import animate
+from .picture_files import JPEG_QUALITY, PictureOutput
+from .pixels import Color, Pixels, animate
 
 if TYPE_CHECKING:
     from ..cameras.sources import CameraPath
     from ..render.render_settings import RenderSettings
     from ..viewers.scenes import CutFinder
-    from .picture_files import PictureOutput
-    from .pixels import Color, Pixels
 
 #: Maximum total number of pixels of the pictures that are cached after finding a gain until their frames are written:
 #: 2 GB of floats.
 CACHED_PIXELS = 1 << 26
 
-#: Pictures and those of the reference that were drawn to find the gain, by camera index.
+#: Pictures that were drawn to find the gain, each with its reference, by camera index.
 Cached = dict[int, tuple[DrawnPicture, DrawnPicture]]
 
 
@@ -41,7 +39,8 @@ class PictureSettings:
 
     Attributes:
         background: red, green and blue, 0..1, behind the splats; None keeps alpha.
-        gain: factor by which differences are multiplied; None chooses one from the pictures.
+        bar: draw a colour scale beside pictures that have one.
+        gain: factor for differences; None chooses one from the pictures.
         jobs: number of pictures drawn at the same time, with `threads` each.
     """
 
@@ -55,14 +54,14 @@ class PictureSettings:
 
 @dataclass(frozen=True)
 class WrittenPictures:
-    """The pictures that were written.
+    """Report on pictures written to files.
 
     Attributes:
         frames: for each camera its number, time, name, splats drawn, width and height of the picture, its file if each
             frame has one, and with a reference the PSNR in dB.
-        bytes: size of all files together.
-        gain: factor by which differences were multiplied; None without a reference.
-        empty: no splat is in view of any camera.
+        bytes: total size of the files.
+        gain: factor for differences; None without a reference.
+        empty: no camera sees a splat.
     """
 
     frames: list[dict[str, Any]]
@@ -84,11 +83,42 @@ def write_pictures(
 ) -> WrittenPictures:
     """Render and write the pictures of a camera path.
 
-    Cameras of an animation or a contact sheet have one size. With a `reference`, pictures are differences from it;
-    `SparklodError` if it covers no pixel of a frame, or as by `Renderer` and `animate`.
+    Cameras of an animation or a contact sheet have one size. With a `reference`, pictures are differences from it.
+
+    Raises:
+        SparklodError: the reference covers no pixel of a frame; errors of `Renderer` and `animate`.
     """
     facts: list[dict[str, Any]] = []
     count, size, empty = len(path.cameras), 0, True
+    alone = output.kind in ("picture", "frames")
+
+    def finish(at: int) -> tuple[dict[str, Any], bool, Pixels | bytes]:
+        """Draw a picture; return its facts, whether it is empty, and its file or, where files hold several, pixels."""
+        camera, number = path.cameras[at], path.numbers[at]
+        with on_threads(settings.threads):  # the setting is per Python thread
+            drawn, expected = cached.pop(at, (None, None))
+            drawn = drawn or renderer.draw(camera)
+            expected = expected or (None if other is None else other.draw(camera))
+        fact = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
+        fact |= {"width": camera.width, "height": camera.height}
+        if output.kind == "frames":
+            fact["file"] = str(*output.paths([number]))
+        image = codes.over(drawn.image, settings.background)
+        if expected is not None:
+            metrics.check_covered(expected.image, f"what --diff names, in frame {number},")
+            right = codes.over(expected.image, settings.background)
+            fact["psnr_db"] = round(metrics.psnr(*(np.clip(each[..., :3], 0, 1) for each in (image, right))), 3)
+            image = codes.difference(image, right, gain)
+        empty = not drawn.image[..., 3].any()
+        if output.form == "npy":  # the values behind the colours if they are per pixel, else the colours
+            values = drawn.values if render.color_by in OF_PIXELS and drawn.values is not None else image
+            return fact, empty, codes.encode_floats(values)
+        pixels = codes.eight_bits(image)
+        bar = renderer.scale if other is None else codes.difference_bar(gain)
+        if settings.bar and bar is not None:
+            pixels = codes.with_scale(pixels, bar)
+            fact["width"] = pixels.shape[1]
+        return fact, empty, codes.encode(pixels, output.form, settings.jpeg_quality) if alone else pixels
 
     def drawn() -> Iterator[Any]:
         nonlocal empty
@@ -105,7 +135,6 @@ def write_pictures(
         gain, cached = settings.gain or 1.0, Cached()
         if other is not None and not settings.gain:
             gain, cached = _fitting_gain(renderer, other, path, settings, progress)
-        finish = functools.partial(_finished, renderer, other, path, output, settings, gain, cached)
         if output.kind == "frames":
             for target, data in zip(output.paths(path.numbers), drawn(), strict=True):
                 size += write_file(target, [data], overwrite=overwrite)
@@ -123,63 +152,15 @@ def write_pictures(
 
 
 def frame_rate(path: CameraPath) -> float:
-    """Mean number of frames per second."""
+    """Return the mean number of frames per second."""
     span = path.cameras[-1].time - path.cameras[0].time
     return (len(path.cameras) - 1) / span if span > 0 else DEFAULT_FPS
-
-
-def _finished(
-    renderer: Renderer,
-    reference: Renderer | None,
-    path: CameraPath,
-    output: PictureOutput,
-    settings: PictureSettings,
-    gain: float,
-    cached: Cached,
-    at: int,
-) -> tuple[dict[str, Any], bool, Pixels | bytes]:
-    """Draw the picture of a camera; see `write_pictures`.
-
-    Returns:
-        Facts for the report, whether no splat is in view, and the bytes of its file, or its pixels where several
-        pictures share a file.
-    """
-    camera, number = path.cameras[at], path.numbers[at]
-    with on_threads(settings.threads):  # the setting is per Python thread
-        drawn, other = cached.pop(at, (None, None))
-        drawn = drawn or renderer.draw(camera)
-        other = other or (None if reference is None else reference.draw(camera))
-    facts = {"frame": number, "time_s": camera.time, "name": camera.name, "splats": drawn.splats}
-    facts |= {"width": camera.width, "height": camera.height}
-    if output.kind == "frames":
-        facts["file"] = str(*output.paths([number]))
-    image = codes.over(drawn.image, settings.background)
-    if other is not None:
-        from .metrics import check_covered, psnr
-
-        check_covered(other.image, f"what --diff names, in frame {number},")
-        expected = codes.over(other.image, settings.background)
-        facts["psnr_db"] = round(psnr(*(np.clip(each[..., :3], 0, 1) for each in (image, expected))), 3)
-        image = codes.difference(image, expected, gain)
-    empty = not drawn.image[..., 3].any()
-    if output.form == "npy":
-        # The values behind the colours if they are per pixel, else the colours.
-        by = renderer.settings.color_by
-        values = drawn.values if by in OF_PIXELS and drawn.values is not None else image
-        return facts, empty, codes.encode_floats(values)
-    pixels = codes.eight_bits(image)
-    bar = renderer.scale if reference is None else codes.difference_bar(gain)
-    if settings.bar and bar is not None:
-        pixels = codes.with_scale(pixels, bar)
-        facts["width"] = pixels.shape[1]
-    alone = output.kind in ("picture", "frames")
-    return facts, empty, codes.encode(pixels, output.form, settings.jpeg_quality) if alone else pixels
 
 
 def _fitting_gain(
     renderer: Renderer, reference: Renderer, path: CameraPath, settings: PictureSettings, progress: Progress
 ) -> tuple[float, Cached]:
-    """Return the gain for all pictures, chosen from the first, the middle and the last one; and these, if small."""
+    """Choose the gain for all pictures from the first, the middle and the last one; also return these, if small."""
     cameras, background, cached = path.cameras, settings.background, Cached()
     some = sorted({0, len(cameras) // 2, len(cameras) - 1}, reverse=True)
     keep = 2 * sum(cameras[at].width * cameras[at].height for at in some) <= CACHED_PIXELS

@@ -1,4 +1,4 @@
-"""Colours for numbers: perceptually even ramps, scales that explain them, and scales of what cameras see."""
+"""Colour scales: perceptually uniform ramps with labels, and their ranges for what cameras see."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from ..viewers.loaded_scene import TREE, Index, LoadedScene
 from ..viewers.scenes import CutFinder, Part
 from .render_settings import RasterSettings
 
-#: Stops of matplotlib's ramps (CC0), evenly spaced, without the darkest, which are lost on a dark ground.
+#: Evenly spaced stops of matplotlib's ramps (CC0), without the darkest, which are invisible on a dark background.
 VIRIDIS = ("414487", "355f8d", "2a788e", "21918c", "22a884", "44bf70", "7ad151", "bddf26", "fde725")
 PLASMA = ("5c01a6", "8606a6", "a92395", "c5407e", "db5c68", "ed7953", "f99a3e", "fdc527", "f0f921")
 MAGMA = ("51127c", "721f81", "952c80", "b73779", "d8456c", "f1605d", "fc8961", "feb078", "fed799", "fcfdbf")
 
-#: The share of the numbers, in percent, beyond either end of a scale: those have the colour of that end.
+#: Percentage of outliers beyond either end of a scale, which have the colour of that end.
 CLIPPED = 1
 
-Mark = tuple[float, str]
-
-#: The least span of a logarithmic scale, in powers of ten.
+#: Least span of a logarithmic scale, in powers of ten.
 LEAST_DECADES = 0.1
+
+#: Position on a scale, 0..1, and its label.
+Mark = tuple[float, str]
 
 
 @dataclass(frozen=True)
 class Coloring:
-    """A colour scale: colours for numbers, and the marks that explain them.
+    """A colour scale for numbers, with labels.
 
     Attributes:
         title: the quantity, for display.
-        ramp: (S, 3) uint8 colours of the scale, from its low to its high end; few and distinct for whole numbers.
-        marks: positions on the scale, 0..1, and their labels.
-        low, high: numbers of the first and of the last colour; numbers beyond have the same colours.
+        ramp: (S, 3) uint8 colours from low to high; few and distinct for whole numbers.
+        low, high: values of the first and of the last colour; values beyond have the same colours.
         log: `low` and `high` are decimal logarithms.
     """
 
@@ -53,7 +53,7 @@ class Coloring:
     log: bool = False
 
     def rgb(self, values: NDArray[Any]) -> NDArray[np.uint8]:
-        """Return (..., 3) colours of numbers; NaN has the first colour."""
+        """Return (..., 3) colours of values; NaN has the first colour."""
         values = np.asarray(values, np.float64)
         if self.log:
             values = np.log10(np.clip(values, 1e-30, 1e30))
@@ -62,41 +62,38 @@ class Coloring:
 
 
 def ramp(stops: tuple[str, ...], count: int) -> NDArray[np.uint8]:
-    """Return (count, 3) colours, evenly spaced along a ramp; a single one is from its middle."""
+    """Return (count, 3) colours, evenly spaced along a ramp; a single colour is from its middle."""
     table = np.array([list(bytes.fromhex(stop)) for stop in stops], np.float64)
     at = np.linspace(0, len(table) - 1, count) if count > 1 else np.array([(len(table) - 1) / 2])
-    channels = [np.interp(at, np.arange(len(table)), channel) for channel in table.T]
-    return np.stack(channels, 1).round().astype(np.uint8)
+    return np.stack([np.interp(at, np.arange(len(table)), each) for each in table.T], 1).round().astype(np.uint8)
 
 
-def whole_numbers(title: str, low: int, high: int, *, least: int | None = None, most: int | None = None) -> Coloring:
-    """Return a colour for each whole number from low to high; `least` and `most` may lie beyond these ends."""
+def whole_numbers(title: str, low: int, high: int, *, less: bool = False, more: bool = False) -> Coloring:
+    """Return a scale with a colour for each whole number; `less` and `more` say that values lie beyond its ends."""
     count = high - low + 1
     every = math.ceil(count / 12)
     labelled = [*range(low, high - every // 2, every), high] if count > 1 else [low]
     text = {value: f"{value}" for value in labelled}
-    if least is not None and least < low:
-        text[low] += " or less"
-    if most is not None and most > high:
-        text[high] += " or more"
+    text[low] += " or less" * less
+    text[high] += " or more" * more
     marks = tuple(((value - low + 0.5) / count, text[value]) for value in labelled)
     return Coloring(title, ramp(VIRIDIS, count), marks, low, high)
 
 
 def depth_scale(title: str, values: NDArray[Any]) -> Coloring:
-    """Return the scale of whole numbers, without outliers at either end."""
+    """Return a scale of whole numbers without outliers at either end."""
     least, most = int(values.min()), int(values.max())
-    low, high = np.percentile(values, [CLIPPED, 100 - CLIPPED]) if most - least > 1 else (least, most)
-    return whole_numbers(title, int(low), int(high), least=least, most=most)
+    low, high = map(int, np.percentile(values, [CLIPPED, 100 - CLIPPED]) if most - least > 1 else (least, most))
+    return whole_numbers(title, low, high, less=least < low, more=most > high)
 
 
 def smooth(title: str, stops: tuple[str, ...], marks: list[Mark], low: float, high: float) -> Coloring:
-    """Return a ramp without steps."""
+    """Return a scale with a continuous ramp."""
     return Coloring(title, ramp(stops, 256), tuple(marks), low, high)
 
 
 def linear(title: str, stops: tuple[str, ...], low: float, high: float, apart: float | None) -> Coloring:
-    """Return a ramp with round numbers; `apart`, if numbers lie beyond its ends, is that of `with_ends`."""
+    """Return a scale labelled with round numbers and, unless `apart` is None, its ends, see `with_ends`."""
     marks = [((tick - low) / (high - low), text) for tick, text in ticks(low, high, (high - low) / 6)]
     if apart is not None:
         marks = with_ends(marks, f"{low:.3g} or less" if low else None, f"{high:.3g} or more", apart)
@@ -104,13 +101,13 @@ def linear(title: str, stops: tuple[str, ...], low: float, high: float, apart: f
 
 
 def opacity_scale(title: str, values: FloatArray, apart: float) -> Coloring:
-    """Return the scale of D, which ends at 1, or above it at the next tenth."""
+    """Return the scale of LoD opacity D, from 0 to 1, or to the tenth above nearly all values."""
     top = max(1.0, math.ceil(10 * float(np.percentile(values, 100 - CLIPPED))) / 10)
     return linear(title, MAGMA, 0.0, top, apart if values.max() > top else None)
 
 
 def size_scale(values: FloatArray, apart: float, *, sampled: bool) -> Coloring:
-    """Return the logarithmic scale of sizes; of a sample, other sizes may lie beyond its ends."""
+    """Return the logarithmic scale of sizes; values of a sample imply that others lie beyond its ends."""
     logs = np.log10(np.clip(values, 1e-30, 1e30).astype(np.float64))
     low, high = (float(end) for end in np.percentile(logs, [CLIPPED, 100 - CLIPPED]))
     if high - low < LEAST_DECADES:
@@ -127,19 +124,19 @@ def size_scale(values: FloatArray, apart: float, *, sampled: bool) -> Coloring:
 
 
 def with_ends(marks: list[Mark], low: str | None, high: str | None, apart: float) -> list[Mark]:
-    """Return the marks of a scale and its ends, without marks nearer to the ends than `apart`."""
+    """Add marks at the ends of a scale, unless None, and drop marks nearer to them than `apart`."""
     ends = [(place, text) for place, text in ((0.0, low), (1.0, high)) if text is not None]
     return [mark for mark in marks if all(abs(mark[0] - place) > apart for place, _ in ends)] + ends
 
 
 def nice_step(least: float) -> float:
-    """Return the smallest number of the form 1, 2 or 5 times a power of ten that is not below `least`."""
+    """Return the smallest number not below `least` that is 1, 2 or 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(step for step in (power, 2 * power, 5 * power, 10 * power, 20 * power) if step >= least * (1 - 1e-9))
 
 
 def ticks(low: float, high: float, least: float) -> list[tuple[float, str]]:
-    """Return round numbers from `low` to `high`, at least `least` apart, and their texts."""
+    """Return round numbers from `low` to `high`, at least `least` apart, with their texts."""
     step = nice_step(least)
     digits = max(0, -math.floor(math.log10(step) + 1e-9))
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
@@ -147,21 +144,17 @@ def ticks(low: float, high: float, least: float) -> list[tuple[float, str]]:
     return [(step * n, f"{step * n:.{digits}f}" if plain else f"{step * n:.6g}") for n in range(first, last + 1)]
 
 
-#: Sample sizes, splats and cameras, to find the ends of a scale.
-SAMPLE, CAMERAS = 1 << 18, 64
+#: Largest samples that determine the ends of a scale: of splats, of cameras, and of cameras whose cuts are computed.
+SAMPLE, CAMERAS, CUTS = 1 << 18, 64, 16
 
-#: Most cameras whose cuts are computed to find the ends of a scale.
-CUTS = 16
-
-#: Least distance of a mark from the ends of a scale, as a share of it; nearer marks would touch those of the ends.
+#: Least distance of a mark from the ends of a scale, as a share of it; nearer labels would touch.
 APART = 0.05
 
 
 def values_of(by: str, part: Part) -> FloatArray:
-    """Return (M,) values of a quantity of splats: "level", "lod-opacity", "size" or "chunk".
+    """Return (M,) values of a quantity of the splats in a part: "level", "lod-opacity", "size" or "chunk".
 
-    A level is a depth in a tree, or a detail level. Sizes are in world units; splats of files without either are of
-    level 0.
+    A level is a depth in a tree or a detail level, and 0 in other files. Sizes are in world units.
     """
     if by in ("level", "chunk"):
         return numbers_of(by, part.scene, part.index).astype(np.float64)
@@ -171,27 +164,25 @@ def values_of(by: str, part: Part) -> FloatArray:
 
 
 def scale_of_splats(by: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress = silent) -> Coloring:
-    """Return the scale of a quantity of `values_of`: of whole numbers in the cuts of cameras, of others in all splats.
+    """Return the scale of a quantity of `values_of`, over the cuts of cameras for whole numbers, else over all splats.
 
-    `SparklodError` by level, where no file has any.
+    `SparklodError` by level if no file has levels.
     """
     candidates = source.candidates().parts
     if by == "level" and not any(part.scene.kind for part in candidates):
         raise SparklodError("there are no levels to colour by: no file is a Level-of-Detail tree, or Streamed SOG")
-    if by == "level":
-        detail = not any(part.scene.kind == TREE for part in candidates)
-        return _whole(by, "detail level" if detail else "tree depth", source, cameras, progress)
-    if by == "chunk":
-        return _whole(by, by, source, cameras, progress)
+    if by in ("level", "chunk"):
+        level = "tree depth" if any(part.scene.kind == TREE for part in candidates) else "detail level"
+        return _scale_of_cuts(by, level if by == "level" else by, source, cameras, progress)
     every = max(1, sum(len(part.index) for part in candidates) // SAMPLE)
     values = np.concatenate([values_of(by, part)[::every] for part in candidates])
-    return (
-        opacity_scale("LoD opacity", values, APART) if by == "lod-opacity" else size_scale(values, APART, sampled=True)
-    )
+    if by == "lod-opacity":
+        return opacity_scale("LoD opacity", values, APART)
+    return size_scale(values, APART, sampled=True)
 
 
 def scale_of_depth(source: CutFinder, cameras: Sequence[Camera], settings: RasterSettings) -> Coloring:
-    """Return the scale of the depths of the splats that cameras see, without outliers."""
+    """Return the scale of the depths of splats in the frusta of cameras, without outliers."""
     parts = source.candidates().parts
     every = max(1, sum(len(part.index) for part in parts) // SAMPLE)
     centers = np.concatenate([moved(part.splats.center[::every], part.object_to_world) for part in parts])
@@ -212,13 +203,13 @@ def scale_of_depth(source: CutFinder, cameras: Sequence[Camera], settings: Raste
 
 
 def scale_of_overdraw(counts: Sequence[FloatArray]) -> Coloring:
-    """Return the scale from 0 to the overdraw of nearly all pixels of some pictures."""
+    """Return the scale from 0 to the overdraw of nearly all pixels."""
     most = max(float(np.percentile(count, 99.9)) for count in counts)
     return linear("overdraw", MAGMA, 0.0, max(1.0, float(math.ceil(most))), APART)
 
 
-def _whole(by: str, title: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress) -> Coloring:
-    """Return the scale from the least to the largest number in the cuts of a sample of the cameras."""
+def _scale_of_cuts(by: str, title: str, source: CutFinder, cameras: Sequence[Camera], progress: Progress) -> Coloring:
+    """Return the scale of the whole numbers that occur in the cuts of a sample of the cameras."""
     every = -(-len(cameras) // CUTS)
     some = cameras[::every]
     ends = []
@@ -226,12 +217,10 @@ def _whole(by: str, title: str, source: CutFinder, cameras: Sequence[Camera], pr
         seen = (numbers_of(by, part.scene, part.index) for part in source.cut(camera).parts)
         ends += [(int(numbers.min()), int(numbers.max())) for numbers in seen if len(numbers)]
         progress("colours", done, len(some), "cut")
-    ends = ends or [(0, 0)]
-    low, high = min(low for low, _ in ends), max(high for _, high in ends)
-    beyond = int(every > 1)
-    return whole_numbers(title, low, high, least=low - beyond, most=high + beyond)
+    low, high = min((low for low, _ in ends), default=0), max((high for _, high in ends), default=0)
+    return whole_numbers(title, low, high, less=every > 1, more=every > 1)
 
 
 def numbers_of(by: str, scene: LoadedScene, index: Index) -> NDArray[np.int64]:
-    """Return (M,) the "level" or the "chunk" of some splats of a file; without levels, all are of level 0."""
+    """Return the (M,) "level" or "chunk" of splats of a file; see `values_of`."""
     return scene.chunk_of(index) if by == "chunk" else scene.depth[index].astype(np.int64)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -28,21 +27,22 @@ from .kernels.project import MAX_COLOR
 from .rasterizer import Image, ShadedSplats, world_to_camera
 from .render_settings import BLUR, CLIP, RasterSettings
 
+Words = NDArray[np.uint32]
 Indices = NDArray[np.uint32]
 
 
 class Order:
-    """Finds the splats to draw, from near to far, for a moving camera.
+    """Order of the splats, from near to far, for a moving camera.
 
     Args:
-        sorting: one of `settings.SORTINGS`.
+        sorting: one of `render_settings.SORTINGS`.
         throttle: splats are sorted again only when the cosine between the camera's direction at the last sort and its
             current direction is at most 1 - throttle; antimatter15's viewer uses 0.01, an angle of 8.1 degrees. 0 sorts
-            for each camera. With `RasterSettings.sort` "radial", which depends on the camera's position, they are also
-            sorted when it has moved so far that the splat of median distance appears rotated by that angle.
+            for each camera. With `RasterSettings.sort` "radial", which depends on the camera's position, splats are
+            also sorted when it has moved so far that the splat of median distance appears rotated by that angle.
     """
 
-    def __init__(self, sorting: str, throttle: float = 0.0) -> None:
+    def __init__(self, sorting: str, throttle: float) -> None:
         self.sorting, self.throttle = sorting, throttle
         self._sorted: tuple[Camera, RasterSettings, float] | None = None
 
@@ -50,7 +50,7 @@ class Order:
         self._sorted = None
 
     def update(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> Indices | None:
-        """Return indices of the splats that may be visible, in order; None while the last order is still valid."""
+        """Sort the splats that may be visible; return their indices, or None while the last order is still valid."""
         if self._sorted is not None and self._close(camera, raster, *self._sorted):
             return None
         with np.errstate(over="ignore", invalid="ignore"):  # splats that far away are not drawn
@@ -58,8 +58,7 @@ class Order:
             # Right, down and forward, rounded as in the rasterizer's kernel.
             u, v, depth = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in world_to_camera(camera))
             key = np.sqrt(u * u + v * v + depth * depth) if raster.sort == "radial" else depth
-            if self.throttle:
-                # Splats that are invisible now may be visible when this order is reused.
+            if self.throttle:  # splats that are invisible now may be visible when this order is reused
                 seen = np.flatnonzero(np.isfinite(key)).astype(np.uint32)
             else:
                 seen = _in_sight(splats, u, v, depth, camera, raster)
@@ -124,30 +123,25 @@ CORNERS = np.array([[-2, -2], [2, -2], [2, 2], [-2, 2]], np.float32)
 _T = TypeVar("_T")
 
 
-def draw(
-    splats: ShadedSplats,
-    camera: Camera,
-    raster: RasterSettings,
-    *,
-    precision: str = "float",
-    sorting: str = "exact",
-    throttle: float = 0.0,
-) -> Image:
-    """Draw the picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
+def draw(splats: ShadedSplats, camera: Camera, raster: RasterSettings, **options: Any) -> Image:
+    """Draw the picture of a camera, see `rasterizer.draw`; `options` are those of `OpenGLRenderer`.
 
-    OpenGL objects are reused from frame to frame. `precision` is one of `PRECISIONS`; `sorting` and `throttle` are
-    those of `Order`. `BackendError` if OpenGL is not available, or the picture or the scene exceeds its limits.
+    `BackendError` if OpenGL is not available, or the picture or the scene exceeds its limits.
     """
-    return _renderer(precision=precision, sorting=sorting, throttle=throttle).draw(splats, camera, raster)
+    return _renderer(**options).draw(splats, camera, raster)
 
 
 class OpenGLRenderer:
-    """Draws a sequence of frames; compiles once, and uploads only what has changed."""
+    """Draws a sequence of frames; compiles once, and uploads only what has changed.
+
+    `precision` is one of `PRECISIONS`; `sorting` and `throttle` are those of `Order`.
+    """
 
     def __init__(self, *, precision: str = "float", sorting: str = "exact", throttle: float = 0.0) -> None:
-        self._data, self._order = DATA_TEXTURES[precision](), Order(sorting, throttle)
+        self._pack, self._order = PRECISIONS[precision], Order(sorting, throttle)
         self.uploads = self.sorts = 0
         self._count, self._capacity, self._size = 0, 0, (0, 0)
+        self._last: ShadedSplats | None = None
         self._texture: Any = None
         self._target: Any = None
         self._indices: Any = None
@@ -181,19 +175,21 @@ class OpenGLRenderer:
         return image
 
     def _upload(self, splats: ShadedSplats) -> None:
-        changed, moved = self._data.update(splats)
+        before, self._last = self._last, splats
+        moved = before is None or not _is_same(before, splats, GEOMETRY)
         if moved:
             self._order.forget()
-        if not changed and self._texture is not None:  # it is None after a scene that was too large
+        elif before is not None and self._texture is not None and _is_same(before, splats, ("rgb",)):
             return
-        height, width = self._data.texture.shape[:2]
+        texture = self._pack(splats)
+        height, width = texture.shape[:2]
         if self._texture is None or self._texture.height != height:
-            self._texture = None
+            self._texture = None  # and stays so after a scene that is too large
             self._check_edge(max(height, width), f"{len(splats):,} splats")
             self._texture = self._context.texture((width, height), 4, dtype="u4")
             self._texture.filter = self._context.NEAREST, self._context.NEAREST
             self._check(f"a texture for {len(splats):,} splats")
-        self._texture.write(self._data.texture)
+        self._texture.write(texture)
         self.uploads += 1
 
     def _sort(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> None:
@@ -249,23 +245,14 @@ _renderer = functools.lru_cache(maxsize=2)(OpenGLRenderer)
 def on_gl_thread(work: Callable[..., _T], *arguments: Any) -> _T:
     """Run a function on the thread that makes all calls to OpenGL.
 
-    A thread has one current context. On its own thread, our context cannot interfere with that of VTK, for example:
-    drivers rely on a context staying current, and otherwise draw nothing, or into another context.
+    A thread has one current context. On a thread of its own, ours cannot interfere with that of VTK, for example, which
+    otherwise draws nothing, or into another context.
     """
     thread, process = _thread()
     if process != os.getpid():  # Mesa's threads do not survive a fork, and it would wait for them forever
         raise BackendError("OpenGL cannot be used in a forked process; start processes with spawn instead of fork")
-    return thread.submit(_translated, work, *arguments).result()
-
-
-@functools.cache
-def _thread() -> tuple[ThreadPoolExecutor, int]:
-    return ThreadPoolExecutor(1, "sparklod-gl"), os.getpid()
-
-
-def _translated(work: Callable[..., _T], *arguments: Any) -> _T:
     try:
-        return work(*arguments)
+        return thread.submit(work, *arguments).result()
     except Exception as error:
         if type(error).__module__.lstrip("_") == "moderngl":  # which may not be installed
             message = str(error).split("\n")[0]
@@ -274,10 +261,15 @@ def _translated(work: Callable[..., _T], *arguments: Any) -> _T:
 
 
 @functools.cache
-def open_context() -> Any:
-    """Return the moderngl.Context of this process, created on the first call; call and use it `on_gl_thread` only.
+def _thread() -> tuple[ThreadPoolExecutor, int]:
+    return ThreadPoolExecutor(1, "sparklod-gl"), os.getpid()
 
-    Where OpenGL is not available, BackendError names the packages to install.
+
+@functools.cache
+def open_context() -> Any:
+    """Return the moderngl.Context of this process, to be called and used `on_gl_thread` only.
+
+    `BackendError`, with the packages to install, if OpenGL is not available.
     """
     with optional_import("the backend osmesa needs moderngl", "render", BackendError, package="moderngl"):
         import moderngl  # noqa: F401
@@ -304,8 +296,7 @@ def _glsl_constants(**values: float) -> str:
     )
 
 
-#: Of `model.falloff`: `deviations_of`, the root of `end_of`, and the alpha of a splat by z^2; `shifted` is a uniform of
-#: the shader.
+#: GLSL of `model.falloff`: `deviations_of`, the root of `end_of`, and the alpha of a splat by z^2.
 _FALLOFF = f"""
 {
     _glsl_constants(
@@ -319,7 +310,7 @@ _FALLOFF = f"""
 }
 const int ROOT_HALF = 0x3F3504F3;  // the bits of sqrt(1 / 2)
 
-// The rasterizer's: to 4e-7 of itself near 1 as well, which logarithms of drivers need not be.
+// As in the rasterizer: exact to a factor of 4e-7 even near 1, where logarithms of drivers need not be.
 float log2_exactly(float v) {{
     int bits = floatBitsToInt(v), whole = (bits - ROOT_HALF) >> 23;
     float m = intBitsToFloat(bits - (whole << 23));  // from sqrt(1 / 2) to sqrt(2)
@@ -359,7 +350,16 @@ _CONSTANTS = _glsl_constants(
     MAX_VARIANCE=float(MAX_VARIANCE),
 )
 
-#: GLSL that reads a splat from the texels of `Floats`, and computes its covariance on the screen.
+#: The splat that the vertex shader draws.
+_SPLAT = """
+uniform usampler2D data;
+vec3 center, rgb, scale;
+vec4 quat;
+float lod_opacity;
+mat3 covariance;
+"""
+
+#: GLSL that reads a splat of `float_texture`, and computes its covariance on the screen.
 _FLOATS = """
 const int TEXELS = 4, ROW_BITS = 11;
 
@@ -391,7 +391,7 @@ vec4 on_screen(vec3 t, vec3 s) {
 }
 """
 
-#: The same for `Halves`.
+#: GLSL that does the same for `half_texture`.
 _HALVES = """
 const int TEXELS = 2, ROW_BITS = 10;
 
@@ -413,7 +413,6 @@ vec4 on_screen(vec3 t, vec3 s) {
 """
 
 _VERTEX = """
-uniform usampler2D data;
 uniform mat4x3 world_to_camera;  // into axes with y down, looking along z
 uniform vec2 focal, principal, size;  // pixels
 uniform vec2 range;  // near and far
@@ -427,13 +426,8 @@ flat out vec3 conic;  // z^2 = A dx^2 + 2 B dx dy + C dy^2, how many standard de
 flat out vec2 end_opacity;  // where that ends, and D
 flat out vec4 rgb_power;  // colour, and exp((D^2 - 1) / e) above 1
 
-vec3 center, rgb, scale;
-vec4 quat;
-float lod_opacity;
-mat3 covariance;
-
 void main() {
-    gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // behind the far plane: not drawn, unless it is put elsewhere
+    gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // behind the far plane, so not drawn, unless overwritten below
     int i = int(index);
     fetch(ivec2((i & ((1 << ROW_BITS) - 1)) * TEXELS, i >> ROW_BITS));
     mat4x3 m = world_to_camera;
@@ -450,7 +444,7 @@ void main() {
     precise vec3 t = j.x * vec3(m[0].x, m[1].x, m[2].x) + k.x * ahead;
     precise vec3 s = j.y * vec3(m[0].y, m[1].y, m[2].y) + k.y * ahead;
     vec4 c = on_screen(t, s);  // xx, xy, yy, and the determinant
-    // Sums of what is not negative: c.x * c.z - c.y * c.y would leave nothing of the determinants of needles.
+    // Sums of non-negative terms: c.x * c.z - c.y * c.y would cancel the determinants of needles.
     precise float before = c.w, det = before + BLUR * (c.x + c.z) + BLUR * BLUR;
     precise float xx = c.x + BLUR, yy = c.z + BLUR, xy = c.y;
     if (!(det > 0.0 && xx < MAX_VARIANCE && yy < MAX_VARIANCE)) return;
@@ -460,7 +454,7 @@ void main() {
 
     precise float mean = 0.5 * (xx + yy);
     precise float spread = sqrt(max(mean * mean - det, 0.0));
-    if (deviations * sqrt(mean + spread) > max_radius) {  // squeezed, each axis by itself
+    if (deviations * sqrt(mean + spread) > max_radius) {  // shorten each axis by itself
         precise vec2 axis = xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
         if (abs(xy) > LEAST_COVARIANCE) axis = vec2(xy, mean + spread - xx);
         precise float norm = 1.0 / sqrt(axis.x * axis.x + axis.y * axis.y);
@@ -478,14 +472,14 @@ void main() {
     end_opacity = vec2(deviations * deviations, d);
     rgb_power = vec4(rgb, d > 1.0 ? exp((d * d - 1.0) / E) : 1.0);
 
-    // The quad lies along the axes of the ellipse. It only says which pixels to look at, so a little more of it does no
-    // harm, and makes up for corners being rounded to parts of a pixel.
+    // The quad lies along the axes of the ellipse. It only bounds the pixels, so it may be a little larger, which makes
+    // up for corners being rounded to parts of a pixel.
     float half_difference = 0.5 * (xx - yy);
     float reach = length(vec2(half_difference, xy));
     float greatest = 0.5 * (xx + yy) + reach;
     vec2 along = xx >= yy ? vec2(half_difference + reach, xy) : vec2(xy, reach - half_difference);
     along = reach > 0.0 ? normalize(along) : vec2(1.0, 0.0);
-    // It ends where the splat gets too faint to be drawn, if that is nearer than its end.
+    // It ends where the splat ends, or earlier where the splat is too faint to be drawn.
     float edge = edge_of(d, deviations);
     vec2 sides = 0.5 * (edge * sqrt(vec2(greatest, det / greatest)) * 1.001 + 0.02);
     vec2 at = middle + corner.x * sides.x * along + corner.y * sides.y * vec2(-along.y, along.x);
@@ -513,131 +507,66 @@ void main() {
 }
 """
 
-_FETCH = {"float": _FLOATS, "half": _HALVES}
-
 
 def sources(precision: str) -> dict[str, str]:
     """Return the sources of the shaders for a data texture of one of `PRECISIONS`."""
     head = f"#version 420 core\n{_CONSTANTS}{_FALLOFF}\n"
-    declarations, main = _VERTEX.split("void main()")
-    vertex = head + declarations + _FETCH[precision] + "void main()" + main
+    vertex = head + _SPLAT + {"float": _FLOATS, "half": _HALVES}[precision] + _VERTEX
     return {"vertex_shader": vertex, "fragment_shader": head + _FRAGMENT}
 
-
-#: Precision of the stored splats: float32, or that of antimatter15's viewer.
-PRECISIONS = ("float", "half")
 
 #: Columns of `ShadedSplats` that do not change when the camera moves; colours do if there are spherical harmonics.
 GEOMETRY = ("center", "scale", "quat_xyzw", "lod_opacity")
 
-Words = NDArray[np.uint32]
+#: Splats in a row of `float_texture`, a power of two, and the four texels of each.
+FLOATS_A_ROW = 2048
+FLOATS = np.dtype(
+    [
+        ("center", "<f4", 3),  # 0: world units
+        ("lod_opacity", "<f4"),  # 12: D
+        ("quat_xyzw", "<f4", 4),  # 16: local to world
+        ("scale", "<f4", 3),  # 32: world units
+        ("unused_a", "<u4"),  # 44: 0
+        ("rgb", "<f4", 3),  # 48
+        ("unused_b", "<u4"),  # 60: 0
+    ]
+)
+assert FLOATS.itemsize == 64
 
 
-class DataTexture(ABC):
-    """The texels of the last splats, cached so that unchanged parts are not computed or uploaded again.
+def float_texture(shaded: ShadedSplats) -> Words:
+    """Pack splats into (H, 4 * `FLOATS_A_ROW`, 4) uint32, row by row, with zeros after the last splat.
 
-    `texture` is (height, splats_a_row * texels_a_splat, 4) uint32, row by row from splat 0; unused texels are 0.
-    `splats_a_row` is a power of two.
+    The texture has rotations and scales instead of covariances, in which float32 would lose the short axis of a thin
+    splat. In whole texels this takes no more space than the six elements of a covariance.
     """
-
-    texels_a_splat: int
-    splats_a_row: int
-
-    def __init__(self) -> None:
-        self.texture: Words = np.zeros((0, self.splats_a_row * self.texels_a_splat, 4), np.uint32)
-        self._last: ShadedSplats | None = None
-
-    def update(self, shaded: ShadedSplats) -> tuple[bool, bool]:
-        """Update the texture; return whether it has changed, and whether anything but colours has.
-
-        Compares values, not array identity: every frame has new arrays, mostly with the same values.
-        """
-        before, self._last = self._last, shaded
-        moved = before is None or not _same(before, shaded, GEOMETRY)
-        if moved:
-            height = max(1, -(-len(shaded) // self.splats_a_row))
-            if len(self.texture) != height:
-                self.texture = np.zeros((height, *self.texture.shape[1:]), np.uint32)
-            self._geometry(shaded)
-        recolored = moved or before is None or not _same(before, shaded, ("rgb",))
-        if recolored:
-            self._colors(shaded)
-        return recolored, moved
-
-    def _rows(self, kind: np.dtype[Any], count: int) -> NDArray[Any]:
-        return self.texture.reshape(-1, 4 * self.texels_a_splat).view(kind)[:count, 0]
-
-    @abstractmethod
-    def _geometry(self, shaded: ShadedSplats) -> None:
-        """Write all but the colours."""
-
-    @abstractmethod
-    def _colors(self, shaded: ShadedSplats) -> None:
-        """Write the colours."""
+    texture = np.zeros((max(1, -(-len(shaded) // FLOATS_A_ROW)), 4 * FLOATS_A_ROW, 4), np.uint32)
+    rows = texture.reshape(-1, 16).view(FLOATS)[: len(shaded), 0]
+    for name in GEOMETRY:
+        rows[name] = getattr(shaded, name)
+    rows["rgb"] = _clamped_colors(shaded)
+    return texture
 
 
-class Floats(DataTexture):
-    """Four texels per splat, in float32.
+def half_texture(shaded: ShadedSplats) -> Words:
+    """Pack splats into the texture of antimatter15's viewer, see `codecs.layouts`.
 
-    Stores rotation and scale instead of the covariance, in which float32 would lose the short axis of a thin splat. In
-    whole texels this takes no more space than the six elements of the covariance.
+    A byte can store neither the opacity of a merged splat nor a colour above 1. So the word that the viewer leaves
+    unused holds two float16: D, and a factor for the colour bytes, usually 1.
     """
-
-    RECORD = np.dtype(
-        [
-            ("center", "<f4", 3),  # 0: world units
-            ("lod_opacity", "<f4"),  # 12: D
-            ("quat_xyzw", "<f4", 4),  # 16: local to world
-            ("scale", "<f4", 3),  # 32: world units
-            ("unused_a", "<u4"),  # 44: 0
-            ("rgb", "<f4", 3),  # 48
-            ("unused_b", "<u4"),  # 60: 0
-        ]
-    )
-    assert RECORD.itemsize == 64
-
-    texels_a_splat, splats_a_row = 4, 2048
-
-    def _geometry(self, shaded: ShadedSplats) -> None:
-        rows = self._rows(self.RECORD, len(shaded))
-        for name in GEOMETRY:
-            rows[name] = getattr(shaded, name)
-
-    def _colors(self, shaded: ShadedSplats) -> None:
-        self._rows(self.RECORD, len(shaded))["rgb"] = _clamped_colors(shaded)
+    rgb = _clamped_colors(shaded)
+    gain = np.maximum(rgb.max(axis=1, initial=0), 1).astype(np.float16)
+    # float16 may round the factor down, and a byte must not overflow.
+    rgb = np.minimum(rgb / gain[:, None].astype(np.float32), 1)
+    opacity, sh = np.minimum(shaded.lod_opacity, 1), np.zeros((len(shaded), COEFFICIENTS[0], 3), np.float32)
+    splats = Splats(shaded.center, shaded.scale, shaded.quat_xyzw, opacity, rgb, sh)
+    texture = layouts.pack_texture(splats)["texture"]
+    texture.reshape(-1, 8).view(np.float16)[: len(shaded), 6:8] = np.stack([shaded.lod_opacity, gain], axis=1)
+    return texture
 
 
-class Halves(DataTexture):
-    """Two texels per splat, in the layout of antimatter15's viewer: `codecs.layouts`.
-
-    A byte cannot store the opacity of a merged splat, nor a colour above 1. So the word that the viewer leaves unused
-    holds two float16: D, and a factor for the colour bytes, usually 1.
-    """
-
-    texels_a_splat, splats_a_row = 2, layouts.SPLATS_A_ROW
-
-    def _geometry(self, shaded: ShadedSplats) -> None:
-        colorless = np.zeros_like(shaded.rgb)
-        sh = np.zeros((len(shaded), COEFFICIENTS[0], 3), np.float32)
-        opacity = np.minimum(shaded.lod_opacity, 1)
-        splats = Splats(shaded.center, shaded.scale, shaded.quat_xyzw, opacity, colorless, sh)
-        self.texture = layouts.pack_texture(splats)["texture"]
-        self._extra(shaded)[:, 0] = shaded.lod_opacity
-
-    def _colors(self, shaded: ShadedSplats) -> None:
-        rgb = _clamped_colors(shaded)
-        gain = np.maximum(rgb.max(axis=1, initial=0), 1).astype(np.float16)
-        # float16 may round the factor down, and a byte must not overflow.
-        bright = np.minimum(rgb / gain[:, None].astype(np.float32), 1)
-        self._rows(layouts.TEXELS, len(shaded))["rgba"][:, :3] = np.rint(bright * 255)
-        self._extra(shaded)[:, 1] = gain
-
-    def _extra(self, shaded: ShadedSplats) -> NDArray[np.float16]:
-        words: NDArray[np.float16] = self.texture.reshape(-1, 8).view(np.float16)[: len(shaded), 6:8]
-        return words
-
-
-DATA_TEXTURES = {"float": Floats, "half": Halves}
+#: Precisions of the stored splats, float32 or that of antimatter15's viewer, and the functions that pack these.
+PRECISIONS = {"float": float_texture, "half": half_texture}
 
 
 def _clamped_colors(shaded: ShadedSplats) -> FloatArray:
@@ -646,7 +575,8 @@ def _clamped_colors(shaded: ShadedSplats) -> FloatArray:
     return rgb
 
 
-def _same(one: ShadedSplats, other: ShadedSplats, columns: tuple[str, ...]) -> bool:
+def _is_same(one: ShadedSplats, other: ShadedSplats, columns: tuple[str, ...]) -> bool:
+    """Compare columns by value, since every frame has new arrays, mostly with the same values."""
     return all(
         (mine := getattr(one, name)) is (theirs := getattr(other, name)) or np.array_equal(mine, theirs)
         for name in columns

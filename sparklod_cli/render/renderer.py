@@ -24,26 +24,20 @@ from .render_settings import CLIP, RasterSettings, RenderSettings, uses_card
 if TYPE_CHECKING:
     from .color_scales import Coloring
 
-#: Name of the backend numba on a card, and modules of the backends; each has a function `draw`.
-ON_CARD = "cuda"
-MODULES = {
-    "numba": ".rasterizer",
-    ON_CARD: ".cuda.card_rasterizer",
-    "osmesa": ".osmesa",
-    "open3d": ".open3d_backend",
-}
+#: Modules of the backends, of which "cuda" is the backend numba on a card; each has a function `draw`.
+MODULES = {"numba": ".rasterizer", "cuda": ".cuda.card_rasterizer", "osmesa": ".osmesa", "open3d": ".open3d_backend"}
 
-#: Held while kernels run: each uses all threads, and some threading layers of numba crash when called concurrently.
+#: Held while kernels run, since some threading layers of numba crash when called concurrently.
 _KERNELS = threading.Lock()
 
 
 @dataclass(frozen=True)
 class DrawnPicture:
-    """A picture.
+    """A picture of a camera.
 
     Attributes:
-        image: (H, W, 4) float32: red, green and blue, multiplied by alpha, and alpha.
-        values: (H, W) float32, the numbers behind the colours where these are of pixels; NaN where there is none.
+        image: (H, W, 4) float32: premultiplied red, green and blue, and alpha.
+        values: (H, W) float32 numbers behind the colours of pixels, NaN where empty; None if splats have the colours.
         splats: number of splats passed to the backend.
     """
 
@@ -53,10 +47,14 @@ class DrawnPicture:
 
 
 class Renderer:
-    """Draws pictures with the same settings; several threads may use it.
+    """Draws pictures with the same settings, on any number of threads.
 
-    Pictures of all `cameras` share the color scale `scale`, None where splats have their own colours. `SparklodError`
-    if the scenes lack the quantity to colour by; `BackendError` if the device is a card, and none is usable.
+    Attributes:
+        scale: the colour scale that the pictures of all `cameras` share; None if splats have their own colours.
+
+    Raises:
+        SparklodError: the scenes lack the quantity to colour by.
+        BackendError: the device is a card, and none is usable.
     """
 
     def __init__(
@@ -66,21 +64,21 @@ class Renderer:
         if settings.device == "cuda" and settings.backend != "numba":
             raise ValueError(f"device is 'cuda'; the backend numba draws on cards, not {settings.backend}")
         on_card = settings.backend == "numba" and settings.device != "cpu" and uses_card(settings.device)
-        self._backend = ON_CARD if on_card else settings.backend
-        # The largest radius counts in pixels of the finer picture, which is the one that is shaded.
+        self._backend = "cuda" if on_card else settings.backend
+        # In pixels of the finer picture, which is the one that is shaded.
         self._raster = replace(settings.raster, max_radius=settings.raster.max_radius * settings.supersample)
+        self.scale: Coloring | None = None
         by = settings.color_by
-        self.scale = None if by is None else self._scale(by, cameras, progress)
+        if by is not None:
+            from . import color_scales
 
-    def _scale(self, by: str, cameras: Sequence[Camera], progress: Progress) -> Coloring:
-        from . import color_scales
-
-        if by == "depth":
-            return color_scales.scale_of_depth(self.source, cameras, self.settings.raster)
-        if by == "overdraw":
-            some = {number: cameras[number] for number in (0, len(cameras) // 2, len(cameras) - 1)}
-            return color_scales.scale_of_overdraw([self._overdraw(self.source.cut(at), at) for at in some.values()])
-        return color_scales.scale_of_splats(by, self.source, cameras, progress)
+            if by == "depth":
+                self.scale = color_scales.scale_of_depth(source, cameras, settings.raster)
+            elif by == "overdraw":
+                some = {number: cameras[number] for number in (0, len(cameras) // 2, len(cameras) - 1)}.values()
+                self.scale = color_scales.scale_of_overdraw([self._overdraw(source.cut(at), at) for at in some])
+            else:
+                self.scale = color_scales.scale_of_splats(by, source, cameras, progress)
 
     def draw(self, camera: Camera) -> DrawnPicture:
         """Draw the picture of a camera; raise `BackendError` if the backend cannot draw here."""
@@ -89,10 +87,9 @@ class Renderer:
         if by == "overdraw":
             values = self._overdraw(cut, camera)
             return DrawnPicture(self._colored(values, (values > 0).astype(np.float32)), values, len(cut))
-        fine = finer(camera, times) if times > 1 else camera
+        fine = finer(camera, times)
         with _KERNELS:
-            degree = self.settings.max_sh if by is None else 0
-            shaded = shade([(part.splats.with_max_sh(degree), part.object_to_world) for part in cut.parts], fine)
+            shaded = _shaded(cut, fine, self.settings.max_sh if by is None else 0)
             if by == "depth":
                 shaded, top = colored_by_depth(shaded, fine, self.settings.raster)
             elif self.scale is not None and by is not None:
@@ -101,9 +98,7 @@ class Renderer:
                 values = np.concatenate([values_of(by, part) for part in cut.parts])
                 shaded = replace(shaded, rgb=self.scale.rgb(values) / np.float32(255))
             style, options = self.settings.style, self.settings.options
-            image = draw_styled(style, self._backend, shaded, fine, self._raster, options)
-        if times > 1:
-            image = averaged(image, times)
+            image = averaged(draw_styled(style, self._backend, shaded, fine, self._raster, options), times)
         if by != "depth":
             return DrawnPicture(image, None, len(cut))
         alpha = image[..., 3]
@@ -113,11 +108,16 @@ class Renderer:
         return DrawnPicture(self._colored(depth, alpha), depth, len(cut))
 
     def _overdraw(self, cut: Cut, camera: Camera) -> NDArray[np.float32]:
+        """Return (H, W) number of splats of the backend numba blended into each pixel, including hidden ones."""
         fine = finer(camera, self.settings.supersample)
+        counts = np.zeros((fine.height, fine.width), np.int32)
         with _KERNELS:
-            shaded = shade([(part.splats.with_max_sh(0), part.object_to_world) for part in cut.parts], fine)
-            counts = count_overdraw(shaded, fine, self._raster)
-        return averaged(counts[..., None], self.settings.supersample)[..., 0]
+            shaded = _shaded(cut, fine, 0)
+            if len(shaded):
+                screen, _, keys = rasterizer.project_splats(shaded, fine, self._raster)
+                is_design, least = self._raster.profile == "shifted", np.float32(MIN_ALPHA)
+                count_fragments(len(counts), screen, keys, is_design, least, counts)
+        return averaged(counts.astype(np.float32)[..., None], self.settings.supersample)[..., 0]
 
     def _colored(self, values: NDArray[np.float32], alpha: NDArray[np.float32]) -> Image:
         assert self.scale is not None
@@ -125,8 +125,12 @@ class Renderer:
         return np.concatenate([rgb * alpha[..., None], alpha[..., None]], axis=2)
 
 
+def _shaded(cut: Cut, camera: Camera, degree: int) -> ShadedSplats:
+    return shade([(part.splats.with_max_sh(degree), part.object_to_world) for part in cut.parts], camera)
+
+
 def colored_by_depth(splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> tuple[ShadedSplats, float]:
-    """Return splats in grays of their depths divided by the largest visible depth, and that depth, world units."""
+    """Color splats with gray levels of depth / largest visible depth; also return the latter, in world units."""
     depth = (splats.center - camera.position.astype(np.float32)) @ camera.forward.astype(np.float32)
     top = float(depth[(depth > raster.near) & (depth < raster.far)].max(initial=raster.near))
     gray = np.clip(np.nan_to_num(depth) / np.float32(top), 0, 1)
@@ -147,7 +151,7 @@ def finer(camera: Camera, times: int) -> Camera:
 
 
 def averaged(image: Image, times: int) -> Image:
-    """Return (H, W, C) means of squares of `times` x `times` pixels."""
+    """Average squares of `times` x `times` pixels."""
     if times == 1:
         return image
     height, width = image.shape[0] // times, image.shape[1] // times
@@ -155,7 +159,7 @@ def averaged(image: Image, times: int) -> Image:
     return fine.mean(axis=(1, 3), dtype=np.float64).astype(np.float32)
 
 
-#: How opaque a billboard is.
+#: Opacity of a billboard.
 BILLBOARD_ALPHA = 0.5
 
 
@@ -165,22 +169,22 @@ def draw_styled(
     splats: ShadedSplats,
     camera: Camera,
     settings: RasterSettings,
-    options: Mapping[str, Any] | None = None,
+    options: Mapping[str, Any],
 ) -> Image:
     """Draw what a camera sees, as `rasterizer.draw` does; `BackendError` if the backend cannot draw here.
 
     Args:
-        style: one of `settings.STYLES`. "points" are opaque, a pixel each, "billboards" discs of one opacity, as wide
-            as the splats; both are drawn in the order of the file. "sorted-billboards" are drawn from far to near, as
-            "splats" are.
+        style: one of `render_settings.STYLES`. "points" are opaque pixels, "billboards" discs of one opacity, as wide
+            as the splats, both in the order of the file; "sorted-billboards" are drawn from far to near, as "splats".
+        options: of the backend's `draw`, which draws "splats".
     """
-    if not len(splats.center):  # no chunk has arrived yet
-        return np.zeros((camera.height, camera.width, 4), np.float32)
+    image: Image = np.zeros((camera.height, camera.width, 4), np.float32)
+    if not len(splats):  # no chunk has arrived yet
+        return image
     if style == "splats":
-        drawn: Image = import_module(MODULES[backend], __package__).draw(splats, camera, settings, **(options or {}))
+        drawn: Image = import_module(MODULES[backend], __package__).draw(splats, camera, settings, **options)
         return drawn
     index, x, y, depth, distance = _on_screen(splats, camera, settings)
-    image: Image = np.zeros((camera.height, camera.width, 4), np.float32)
     if style == "points":
         inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
         row, column = y[inside].astype(np.intp), x[inside].astype(np.intp)
@@ -192,25 +196,17 @@ def draw_styled(
         order = np.argsort(-(distance if settings.sort == "radial" else depth), kind="stable")
     index, depth = index[order], depth[order]
     width = splats.scale[index].mean(axis=1) * size_factor(splats.lod_opacity[index])
-    radius = np.clip(width * np.float32(camera.focal[1]) / depth, 0.5, settings.max_radius)
+    radius = np.clip(width * np.float32(camera.focal[1]) / depth, 0.5, settings.max_radius).astype(np.float32)
     rgb = np.minimum(splats.rgb[index], 1)
-    draw_discs(
-        camera.height,
-        np.ascontiguousarray(x[order]),
-        np.ascontiguousarray(y[order]),
-        radius.astype(np.float32),
-        rgb,
-        np.float32(BILLBOARD_ALPHA),
-        image,
-    )
+    draw_discs(camera.height, x[order], y[order], radius, rgb, np.float32(BILLBOARD_ALPHA), image)
     return image
 
 
 def _on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> tuple[NDArray[Any], ...]:
-    """Return the splats between near and far whose centres are inside the picture, or within `CLIP` of it.
+    """Find the splats between near and far whose centres are in the picture, enlarged by `CLIP`.
 
-    They are (M,) indices; (M,) float32 x and y in pixels from the upper left corner, depths along the axis, and
-    distances.
+    Returns:
+        (M,) indices; x and y in pixels from the upper left corner, float32; depths along the axis; distances.
     """
     local = (splats.center - camera.position.astype(np.float32)) @ camera.camera_to_world[:3, :3].astype(np.float32)
     depth = -local[:, 2]
@@ -226,12 +222,3 @@ def _on_screen(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -
         depth[index],
         np.linalg.norm(local[index], axis=1),
     )
-
-
-def count_overdraw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> NDArray[np.float32]:
-    """Return (height, width) number of splats of the backend numba blended into each pixel, including hidden ones."""
-    counts = np.zeros((camera.height, camera.width), np.int32)
-    if len(splats.center):
-        screen, _, keys = rasterizer.project_splats(splats, camera, settings)
-        count_fragments(len(counts), screen, keys, settings.profile == "shifted", np.float32(MIN_ALPHA), counts)
-    return counts.astype(np.float32)

@@ -293,16 +293,17 @@ def test_frusta_are_what_the_camera_sees() -> None:
 
 def test_ellipsoids_are_where_the_gaussian_says_and_not_thinner_than_a_pixel() -> None:
     splats = random_splats(30)
-    of = pyvista_scene.sphere(1)
-    mesh = pyvista_scene.ellipsoids(splats, 2, of, thinnest=0)
-    points = (mesh.points.reshape(30, len(of.points), 3) - splats.center[:, None]).astype(np.float64)
+    ball = pyvista_scene.sphere(1)
+    surface, normals, triangles = pyvista_scene.ellipsoids(splats, 2, ball, thinnest=0)
+    points = (surface.reshape(30, len(ball[0]), 3) - splats.center[:, None]).astype(np.float64)
     matrices = covariance(splats.scale, splats.quat_xyzw)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(30, 3, 3)
     gradient = np.linalg.solve(matrices[:, None], points[..., None])[..., 0]
     assert np.allclose(np.einsum("nij,nij->ni", points, gradient), 4, rtol=1e-3)
-    normals = mesh.normals.reshape(points.shape)
-    assert np.allclose(normals, gradient / np.linalg.norm(gradient, axis=2, keepdims=True), atol=2e-3)
-    assert mesh.triangles.max() == len(mesh.points) - 1
-    away = pyvista_scene.ellipsoids(splats, 1, of, thinnest=1e4).points.reshape(points.shape) - splats.center[:, None]
+    assert np.allclose(
+        normals.reshape(points.shape), gradient / np.linalg.norm(gradient, axis=2, keepdims=True), atol=2e-3
+    )
+    assert triangles.max() == len(surface) - 1
+    away = pyvista_scene.ellipsoids(splats, 1, ball, thinnest=1e4)[0].reshape(points.shape) - splats.center[:, None]
     assert np.allclose(np.linalg.norm(away, axis=2), 1e4, rtol=1e-5)
 
 
