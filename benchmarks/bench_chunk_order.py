@@ -17,7 +17,7 @@ from scenes import load, tiled
 import sparklod_cli as sparklod
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cameras.framing import framing
-from sparklod_cli.codecs.options import DEFAULTS
+from sparklod_cli.codecs.formats import DEFAULTS
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.lod.chunk_order import arrange
 from sparklod_cli.model.instances import Instance

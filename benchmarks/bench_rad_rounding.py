@@ -20,7 +20,7 @@ from scenes import load
 import sparklod_cli as sparklod
 from sparklod_cli import Splats
 from sparklod_cli.codecs import layouts, spz
-from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.codecs.spark_codings import SplatEncoding

@@ -16,7 +16,7 @@ from scenes import load
 import sparklod_cli as sparklod
 from sparklod_cli.codecs import compression, spz
 from sparklod_cli.codecs.compression import MIXED
-from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
+from sparklod_cli.codecs.formats import DEFAULTS, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.spz import WAYS
 from sparklod_cli.lod.chunk_order import arrange

@@ -33,8 +33,8 @@ if TYPE_CHECKING:  # mypy then resolves the modules first, which import this one
     from .api.views import traverse as traverse
     from .cameras.camera import Camera as Camera
     from .cameras.sources import CameraPath as CameraPath
-    from .codecs.options import RadOptions as RadOptions
-    from .codecs.options import SogOptions as SogOptions
+    from .codecs.formats import RadOptions as RadOptions
+    from .codecs.formats import SogOptions as SogOptions
     from .codecs.rad.rad_header import RadChunkEntry as RadChunkEntry
     from .codecs.rad.rad_header import RadChunkHeader as RadChunkHeader
     from .codecs.rad.rad_header import RadHeader as RadHeader

@@ -12,8 +12,7 @@ import numpy as np
 
 from fixtures import by_hand_sog, by_hand_streamed_sog
 from sparklod_cli.codecs import tiles_3d
-from sparklod_cli.codecs.formats import TILESET
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import TILESET, WriteOptions
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import parts, quality
 from sparklod_cli.lod.tree_settings import TileSettings

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cameras.framing import COVERED, covered, fitted
 from sparklod_cli.codecs import layouts, ply
-from sparklod_cli.codecs.options import DEFAULTS
+from sparklod_cli.codecs.formats import DEFAULTS
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.images.metrics import psnr

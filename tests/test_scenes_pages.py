@@ -11,7 +11,7 @@ import pytest
 
 from sparklod_cli.cameras import framing
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.chunk_order import arrange

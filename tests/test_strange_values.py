@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick

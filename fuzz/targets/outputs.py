@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sparklod_cli.codecs.options import RAD_ENCODINGS
+from sparklod_cli.codecs.formats import RAD_ENCODINGS
 from sparklod_cli.lod.tree_settings import METHODS
 
 from .. import scenes

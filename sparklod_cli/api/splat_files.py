@@ -13,8 +13,18 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from ..codecs.formats import DEFAULT_COMPRESSION, ENCODINGS, MANIFEST, NPZ, RAW_SUFFIXES, WRITABLE, ending_of
-from ..codecs.options import RadOptions, SogOptions, WriteOptions
+from ..codecs.formats import (
+    DEFAULT_COMPRESSION,
+    ENCODINGS,
+    MANIFEST,
+    NPZ,
+    RAW_SUFFIXES,
+    WRITABLE,
+    RadOptions,
+    SogOptions,
+    WriteOptions,
+    ending_of,
+)
 from ..codecs.reader import check_valid
 from ..codecs.spark_codings import SplatEncoding
 from ..io.files import open_named, readable

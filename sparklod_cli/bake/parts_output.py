@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import FARTHEST, rotation_of
-from ..codecs.formats import ENVIRONMENT, folders_of
-from ..codecs.options import WriteOptions
+from ..codecs.formats import ENVIRONMENT, WriteOptions, folders_of
 from ..lod.tree_settings import DetailSettings, TileSettings
 from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..model.gaussian import lod_opacity

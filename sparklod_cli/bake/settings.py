@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..codecs.options import WriteOptions
+from ..codecs.formats import WriteOptions
 from ..io.reading import Merged as Merged
 from ..io.reading import Source as Source
 from ..lod.tree_settings import DEFAULT_BASE, DEFAULT_GROWTH, METHODS

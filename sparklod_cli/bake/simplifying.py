@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..codecs.formats import Format
+from ..codecs.formats import Format, WriteOptions
 from ..codecs.losses import Losses, settled_with_losses
-from ..codecs.options import WriteOptions
 from ..fitting.fit_settings import FitSettings, Refined
 from ..io.writing import encoded, write_scene
 from ..model.falloff import MIN_ALPHA

@@ -10,9 +10,8 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from ..codecs.encoder import CLAMPED, results, windows_of
+from ..codecs.formats import DEFAULTS, RAD_ENCODINGS, WRITABLE, Format, WriteOptions
 from ..codecs.formats import RAD_SUFFIX as RAD
-from ..codecs.formats import WRITABLE, Format
-from ..codecs.options import DEFAULTS, RAD_ENCODINGS, WriteOptions
 from ..io.files import opened
 from ..io.reading import Merged, Source
 from ..io.writing import parts_output, scene_output

@@ -19,7 +19,7 @@ from ..model.splats import FloatArray, Splats
 from ..system.progress import Progress
 from ..system.threads import blocks_of, ordered_map
 from . import quantize
-from .options import WriteOptions
+from .formats import WriteOptions
 
 if TYPE_CHECKING:
     from typing import Protocol

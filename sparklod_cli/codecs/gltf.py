@@ -29,6 +29,7 @@ from ..system.untrusted import quoted_value
 from . import spz
 from .compression import check_promise
 from .encoder import SPZ_RANGES, CodeRange
+from .formats import CESIUM, DEFAULTS, KHRONOS, WriteOptions
 from .gltf_attributes import (
     ATTRIBUTES,
     COMPRESSION,
@@ -60,7 +61,6 @@ from .gltf_container import (
     transform_of,
 )
 from .merging import copy_rows
-from .options import CESIUM, DEFAULTS, KHRONOS, WriteOptions
 from .reader import FileNote, OpenFile, Reader, RowBuffer, encode_rows, left_out, note_of, read_note
 
 #: Extensions that a file may require, and how those begin that change no splats: materials and lights are ignored.

@@ -22,8 +22,7 @@ from ..model.transforms import sh_basis
 from ..system.errors import FormatError
 from ..system.threads import blocks_of, ordered_map
 from .encoder import SPZ_RANGES, CodeRange, Tally, tally
-from .formats import WRITABLE, Format
-from .options import WriteOptions
+from .formats import WRITABLE, Format, WriteOptions
 from .reader import decode_file
 from .spark_codings import SplatEncoding
 

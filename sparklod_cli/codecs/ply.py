@@ -30,7 +30,7 @@ from ..system.threads import blocks_of, ordered_map
 from ..system.units import count_of
 from ..system.untrusted import quoted
 from . import quantize
-from .options import DEFAULTS, WriteOptions
+from .formats import DEFAULTS, WriteOptions
 from .reader import (
     HARMLESS,
     Note,

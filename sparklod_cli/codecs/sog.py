@@ -32,9 +32,8 @@ from ..system.untrusted import Json, Origin, quoted_value
 from . import quantize, sh_palette
 from . import sog_images as codings
 from .compression import check_promise
-from .formats import META, SOG_IMAGES
+from .formats import DEFAULTS, MAX_SH_CODES, META, SOG_IMAGES, WriteOptions
 from .kernels import texels
-from .options import DEFAULTS, MAX_SH_CODES, WriteOptions
 from .reader import Note, OpenCompanion, OpenFile, Reader, RowBuffer, note_of, read_note, size_of
 from .sog_images import (
     MAX_SIDE,

@@ -14,7 +14,7 @@ from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from . import quantize
 from .encoder import CodeRange
-from .options import DEFAULTS, WriteOptions
+from .formats import DEFAULTS, WriteOptions
 from .reader import OpenFile, Reader, RowBuffer, Rows, encode_rows, rows_of
 
 ROW = np.dtype(

@@ -32,8 +32,7 @@ from ..system.threads import blocks_of, ordered_map
 from . import compression, quantize
 from .compression import Inflate, Unzstd
 from .encoder import CLAMPED, SPZ_RANGES, CodeRange, Encoded, Windows, results, tally, windows_of
-from .formats import DEFAULT_SPZ_VERSION, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS
-from .options import DEFAULTS, WriteOptions
+from .formats import DEFAULT_SPZ_VERSION, DEFAULTS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WriteOptions
 from .quantize import ALL_BITS, Bytes
 from .reader import FileNote, OpenFile, Read, Reader, RowBuffer, Scratch, comment_of, read_comment, rows_of
 from .statistics import Statistics, enough, fine_bits

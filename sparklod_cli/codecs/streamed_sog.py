@@ -24,9 +24,8 @@ from ..system.untrusted import quoted_value
 from . import quantize, sog
 from .compression import check_promise
 from .format_rules import check_rules, error_of
-from .formats import ENVIRONMENT_FILE, MANIFEST, META, chunk_folder
+from .formats import ENVIRONMENT_FILE, MANIFEST, META, WriteOptions, chunk_folder
 from .merging import Chunk
-from .options import WriteOptions
 from .reader import OpenCompanion, OpenFile, Reader, note_of, size_of
 from .streamed_manifest import (
     MAX_MANIFEST,

@@ -27,10 +27,9 @@ from ..system.untrusted import quoted_value
 from . import gltf
 from .compression import check_promise
 from .format_rules import check_rules, error_of
-from .formats import TILES, TILESET
+from .formats import CESIUM, TILES, TILESET, WriteOptions
 from .gltf_container import transform_of
 from .merging import Chunk, SceneFiles
-from .options import CESIUM, WriteOptions
 from .reader import Note, OpenCompanion, OpenFile, Reader, note_of
 from .tileset import (
     CONTENT_GLTF,

@@ -11,8 +11,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from ..codecs.formats import MANIFEST, META, NPZ, RAW_SUFFIXES, TILESET, WRITABLE, ending_of
-from ..codecs.options import MAX_SH_CODES, SH_CODES, SogOptions, WriteOptions
+from ..codecs.formats import (
+    MANIFEST,
+    MAX_SH_CODES,
+    META,
+    NPZ,
+    RAW_SUFFIXES,
+    SH_CODES,
+    TILESET,
+    WRITABLE,
+    SogOptions,
+    WriteOptions,
+    ending_of,
+)
 from ..lod.tree_settings import BUILDERS
 from ..model import MAX_SH_DEGREE, UP_AXES
 from ..system.addresses import Place

@@ -28,7 +28,7 @@ from ..system.output import Files, Output, Siblings
 from ..system.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from ..codecs.options import WriteOptions
+    from ..codecs.formats import WriteOptions
 
 
 def _named_by_manifest(target: Place) -> Iterator[str]:

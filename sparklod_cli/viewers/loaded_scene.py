@@ -322,7 +322,7 @@ def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
 
 def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding | None, *, precision: str, threads: int) -> Nodes:
     """Return nodes as a traversal reads them, in one of `codecs.formats.PRECISIONS`."""
-    from ..codecs import layouts, spark_nodes
+    from ..codecs import spark_nodes
 
     if precision == "float32":
         return spark_nodes.Nodes(splats.center, spark_size(splats), tree)

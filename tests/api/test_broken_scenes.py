@@ -18,8 +18,7 @@ import pytest
 
 import sparklod_cli as sparklod
 from sparklod_cli.api.splat_files import Tree
-from sparklod_cli.codecs.formats import ENCODINGS, MANIFEST, WRITABLE
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import ENCODINGS, MANIFEST, WRITABLE, RadOptions, WriteOptions
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene

@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 
 import sparklod_cli as sparklod
 from fuzz.laws import check_passes
-from sparklod_cli.codecs.formats import MANIFEST
-from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, SogOptions
+from sparklod_cli.codecs.formats import MANIFEST, RAD_ENCODINGS, RadOptions, SogOptions
 from sparklod_cli.lod import quick
 from sparklod_cli.lod.tree_settings import METHODS, DetailSettings
 from sparklod_cli.model.gaussian import normalized_quat

@@ -31,8 +31,15 @@ from sparklod_cli.bake.tree_output import BuiltTree, output_of, write_windows
 from sparklod_cli.codecs import encoder as encoding
 from sparklod_cli.codecs import ply, spz
 from sparklod_cli.codecs.encoder import windows_of
-from sparklod_cli.codecs.formats import ENCODINGS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WRITABLE
-from sparklod_cli.codecs.options import RadOptions, SogOptions, WriteOptions
+from sparklod_cli.codecs.formats import (
+    ENCODINGS,
+    MAX_FRACTIONAL_BITS,
+    TREE_SPZ_VERSIONS,
+    WRITABLE,
+    RadOptions,
+    SogOptions,
+    WriteOptions,
+)
 from sparklod_cli.codecs.rad import rad_writer as rad_options
 from sparklod_cli.codecs.reader import Reader
 from sparklod_cli.codecs.spark_codings import log_scale_table

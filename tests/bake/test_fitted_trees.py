@@ -17,8 +17,7 @@ from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import layouts
-from sparklod_cli.codecs.formats import WRITABLE
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import WRITABLE, RadOptions, WriteOptions
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.fitting import fit, pictures
 from sparklod_cli.fitting.fit_settings import SHARES, FitSettings

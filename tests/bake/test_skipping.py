@@ -14,7 +14,7 @@ from sparklod_cli.bake import identity, skipping
 from sparklod_cli.bake.identity import NO_PART, BakeIdentity
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import RadOptions, WriteOptions
 from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.transforms import Transform

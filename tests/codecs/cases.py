@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sparklod_cli.codecs.options import DEFAULTS, WriteOptions
+from sparklod_cli.codecs.formats import DEFAULTS, WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.lod_tree import LodTree

@@ -12,7 +12,7 @@ from fixtures import (
     by_hand_rad,
 )
 from sparklod_cli.codecs import spark_codings
-from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.property_codings import LARGEST_F16
 from sparklod_cli.codecs.rad.rad_header import ENCODING_KEYS

@@ -17,7 +17,7 @@ from zlib_ng import zlib_ng
 
 from sparklod_cli.codecs import compression, spz
 from sparklod_cli.codecs.compression import BLOCK, MIXED, Inflate, Unzstd, Way
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.system.errors import ChecksumError, FormatError, TruncatedError
 from sparklod_cli.system.progress import silent
 from tests.codecs.cases import assert_same, decode, encode

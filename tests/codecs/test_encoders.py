@@ -15,7 +15,7 @@ import pytest
 
 from sparklod_cli.codecs import encoder as encoder_module
 from sparklod_cli.codecs import losses, sh_palette, spz
-from sparklod_cli.codecs.options import DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.reader import OpenFile
 from sparklod_cli.codecs.sh_palette import cluster

@@ -18,8 +18,17 @@ import pytest
 
 from fixtures import by_hand_sog
 from sparklod_cli.cli import run
-from sparklod_cli.codecs.formats import FORMATS, HEAD, JSON_HEAD, WRITABLE, Format, ending_of, head_of, sniff
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import (
+    FORMATS,
+    HEAD,
+    JSON_HEAD,
+    WRITABLE,
+    Format,
+    WriteOptions,
+    ending_of,
+    head_of,
+    sniff,
+)
 from sparklod_cli.codecs.reader import FileNote, comment_of, note_of, read_comment, read_note
 from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.model.lod_tree import LodTree

@@ -21,9 +21,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.codecs import ply, quantize, splat, spz
-from sparklod_cli.codecs.formats import FORMATS, WRITABLE
+from sparklod_cli.codecs.formats import FORMATS, WRITABLE, WriteOptions
 from sparklod_cli.codecs.merging import Placed, merged
-from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.reader import Reader, decode_file
 from sparklod_cli.io.reading import MOST, Merged, open_reader, read_scene

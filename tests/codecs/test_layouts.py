@@ -370,6 +370,7 @@ def zeros(*shape: int, dtype: Any = np.uint32) -> np.ndarray:
         *((layouts.unpack_ext, without(EXTENDED, name), f"no array {name}, only ") for name in EXTENDED),
         (layouts.unpack_nodes, {}, "no array lod_tree"),
         (layouts.unpack_nodes, {"lod_tree": zeros(3, 3)}, "lod_tree is"),
+        (layouts.unpack_nodes, {"lod_tree": np.uint32(0)}, r"lod_tree is uint32\[\], expected uint32\[N, 4\]"),
         (
             layouts.unpack_nodes,
             {"lod_tree": np.uint32([[0, 0, 1, 1], [0, 0, 65536, 2]])},

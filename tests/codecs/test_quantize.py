@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sparklod_cli.codecs import quantize, spz
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.lod import quick
 from sparklod_cli.model.gaussian import linear_opacity, lod_opacity, normalized_quat

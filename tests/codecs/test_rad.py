@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from fixtures import by_hand_rad
 from sparklod_cli import __version__
+from sparklod_cli.codecs.formats import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.losses import clamps_in
-from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.property_codings import CODINGS
 from sparklod_cli.codecs.rad.rad_header import read_header

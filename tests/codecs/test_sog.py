@@ -24,7 +24,7 @@ import sparklod_cli
 from fixtures import by_hand_sog
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import sog, sog_images
-from sparklod_cli.codecs.options import SogOptions, WriteOptions
+from sparklod_cli.codecs.formats import SogOptions, WriteOptions
 from sparklod_cli.codecs.sog_images import MOST_BEFORE, pixels_of, read_header
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.gaussian import normalized_quat

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from sparklod_cli.codecs import spark_codings, spark_nodes
 from sparklod_cli.codecs.spark_codings import STEPS_8_8_8, STEPS_10_10_12
 from sparklod_cli.model.gaussian import normalized_quat
-from sparklod_cli.system.errors import FormatError
 from tests.codecs.cases import random_quats, rotation_degrees
 
 Steps = tuple[int, int]
@@ -140,37 +139,6 @@ def test_decoding_lod_alpha_gives_the_opacity_back(opacity: np.ndarray) -> None:
     assert back.dtype == np.float32
     np.testing.assert_allclose(back, opacity, rtol=2e-5)
     np.testing.assert_array_equal(back[opacity <= 1], opacity[opacity <= 1])
-
-
-# --- Checks of arrays -------------------------------------------------------------------------------------------------
-
-
-TWO, FOUR = np.zeros((3, 2), np.uint32), np.zeros((3, 4), np.uint32)
-
-
-@pytest.mark.parametrize(
-    ("arrays", "text"),
-    [
-        ({}, "no array b, only none"),
-        ({"a": TWO}, "no array b, only a"),
-        ({"b": np.zeros((3, 4), np.int32)}, r"b is int32\[3, 4\], expected uint32\[3, 4\]"),
-        ({"b": np.zeros(12, np.uint32)}, r"b is uint32\[12\], expected uint32\[12, 4\]"),
-        ({"b": np.uint32(0)}, r"b is uint32\[\]"),
-        ({"b": FOUR, "a": FOUR}, r"a is .*, expected uint32\[3, 2\]"),
-        ({"b": FOUR[:0], "a": TWO}, r"a is .*, expected uint32\[0, 2\]"),
-    ],
-)
-def test_wrong_arrays_are_named(arrays: dict[str, np.ndarray], text: str) -> None:
-    with pytest.raises(FormatError, match=text):
-        spark_codings.checked_words(arrays, {"b": 4, "a": 2})
-
-
-def test_arrays_may_be_slices() -> None:
-    words = np.arange(24, dtype=np.uint32).reshape(3, 8)[:, ::2]
-    found = spark_codings.checked_words({"a": words, "else": words}, {"a": 4})
-    assert list(found) == ["a"]
-    assert found["a"].flags.c_contiguous
-    np.testing.assert_array_equal(found["a"], words)
 
 
 def test_the_alpha_that_an_opacity_was_decoded_from_is_found() -> None:

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from fixtures import by_hand
 from sparklod_cli.codecs import quantize, spz
+from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.codecs.losses import clamps_in
-from sparklod_cli.codecs.options import WriteOptions
 from sparklod_cli.codecs.spz import MOST_EXTENSION_BYTES
 from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.model.lod_tree import LodTree

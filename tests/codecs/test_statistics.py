@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.codecs import quantize, spz
-from sparklod_cli.codecs.options import DEFAULTS, RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.statistics import (
     ALL,

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 
 from fixtures import by_hand_sog, by_hand_streamed_sog
 from sparklod_cli.codecs import sog, streamed_manifest, streamed_sog
-from sparklod_cli.codecs.formats import is_of_streamed_sog, sniff
+from sparklod_cli.codecs.formats import DEFAULTS, is_of_streamed_sog, sniff
 from sparklod_cli.codecs.merging import SceneFiles
-from sparklod_cli.codecs.options import DEFAULTS
 from sparklod_cli.codecs.streamed_manifest import LARGEST, Manifest, ManifestNode, Run, parse, serialise
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.io.writing import parts_output

@@ -15,7 +15,7 @@ import pytest
 
 from fixtures import by_hand_glb, by_hand_tiles
 from sparklod_cli.codecs import tiles_3d
-from sparklod_cli.codecs.options import PROFILES, WriteOptions
+from sparklod_cli.codecs.formats import PROFILES, WriteOptions
 from sparklod_cli.codecs.tileset import LARGEST
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.lod import quality

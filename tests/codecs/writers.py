@@ -25,7 +25,7 @@ from fixtures import (
 from sparklod_cli.codecs import gltf as glb
 from sparklod_cli.codecs import ply, quantize, sh_palette, sog, splat, spz
 from sparklod_cli.codecs import sog_images as codings
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.codecs.sog import LARGE, SEEN
 from sparklod_cli.codecs.sog_images import codebook
 from sparklod_cli.model import morton

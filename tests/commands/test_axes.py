@@ -18,7 +18,7 @@ from sparklod_cli.api.sites import prepare
 from sparklod_cli.cli import COMMANDS
 from sparklod_cli.cli import cli as program
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.model.scene import ASSUMED, AXES, SPECIFIED, Scene

@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.commands import console as console_module
 from sparklod_cli.commands.build_lod import ADVICE
 from sparklod_cli.commands.console import Console, count_of, say_error

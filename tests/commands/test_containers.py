@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
-from sparklod_cli.codecs.formats import ENVIRONMENT_FILE
-from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions
+from sparklod_cli.codecs.formats import ENVIRONMENT_FILE, RAD_ENCODINGS, RadOptions
 from sparklod_cli.codecs.rad.rad_header import read_chunk_header, read_header
 from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.lod import quick

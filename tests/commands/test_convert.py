@@ -10,8 +10,7 @@ import pytest
 
 from sparklod_cli.bake.simplifying import leaves_of
 from sparklod_cli.codecs import layouts, spz
-from sparklod_cli.codecs.formats import ENCODINGS, FORMATS, WRITABLE
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import ENCODINGS, FORMATS, WRITABLE, WriteOptions
 from sparklod_cli.codecs.splat import importance_order
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.lod import quick

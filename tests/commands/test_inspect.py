@@ -15,7 +15,7 @@ from PIL import Image
 
 from sparklod_cli.api import reports
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.images import pyvista_scene, scene_plots
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.report import NAMED_FORMATS, SHORT_NAMES

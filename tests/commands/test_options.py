@@ -19,7 +19,7 @@ import pytest
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.cli import COMMANDS
 from sparklod_cli.cli import cli as program
-from sparklod_cli.codecs.options import RadOptions, SogOptions, WriteOptions
+from sparklod_cli.codecs.formats import RadOptions, SogOptions, WriteOptions
 from sparklod_cli.commands.command import Option
 from sparklod_cli.fitting.fit_settings import FitSettings
 from sparklod_cli.images import charts

@@ -11,7 +11,7 @@ import click
 import pytest
 
 from sparklod_cli.cli import cli, run
-from sparklod_cli.codecs.options import RadOptions
+from sparklod_cli.codecs.formats import RadOptions
 from sparklod_cli.commands.command import Option
 from sparklod_cli.commands.rules import LEVELS, RAD, RULES, STREAMED_SOG, TILES_3D, Rule, flag_of
 from sparklod_cli.lod.tree_settings import DetailSettings, TileSettings

@@ -20,8 +20,7 @@ from fixtures import by_hand
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import streamed_manifest, streamed_sog, tiles_3d, tileset
 from sparklod_cli.codecs.compression import PIECE
-from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.codecs.options import PROFILES, WriteOptions
+from sparklod_cli.codecs.formats import FORMATS, PROFILES, WriteOptions
 from sparklod_cli.codecs.rad import rad_header
 from sparklod_cli.commands.inspect import lines
 from sparklod_cli.inspection.findings import CODES, ERROR

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply, spz
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.codecs.reader import decode_file
 from sparklod_cli.inspection import leaves
 from sparklod_cli.inspection.findings import Finding

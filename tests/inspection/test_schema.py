@@ -16,8 +16,7 @@ from jsonschema import Draft202012Validator
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
-from sparklod_cli.codecs.formats import FORMATS
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import FORMATS, WriteOptions
 from sparklod_cli.inspection import values
 from sparklod_cli.inspection.blocks import CHUNK_COLUMNS
 from sparklod_cli.inspection.findings import CODES

@@ -25,7 +25,7 @@ from PIL import Image
 from fixtures import demo_scene
 from sparklod_cli.cameras.camera import Camera
 from sparklod_cli.codecs import streamed_sog
-from sparklod_cli.codecs.options import WriteOptions
+from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.io.reading import read_scene
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.lod import parts, quality

@@ -17,7 +17,7 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import layouts, spz
-from sparklod_cli.codecs.options import RAD_ENCODINGS, RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.codecs.spark_nodes import Nodes

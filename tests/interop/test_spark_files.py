@@ -24,7 +24,7 @@ import sparklod_cli
 from fixtures import by_hand_rad
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import layouts, spz
-from sparklod_cli.codecs.options import DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
 from sparklod_cli.codecs.rad.rad_reader import RadReader

@@ -17,8 +17,8 @@ from sparklod_cli import read, write
 from sparklod_cli.cameras.camera import Camera, look_at
 from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
+from sparklod_cli.codecs.formats import RadOptions, WriteOptions
 from sparklod_cli.codecs.losses import after
-from sparklod_cli.codecs.options import RadOptions, WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.rad.rad_header import RadHeader, read_header
 from sparklod_cli.codecs.spark_codings import SplatEncoding

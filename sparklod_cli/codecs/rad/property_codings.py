@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...model.splats import FloatArray
 from ...system.threads import blocks_of
 from .. import spark_codings
-from ..options import RAD_ENCODINGS
+from ..formats import RAD_ENCODINGS
 from ..quantize import Bytes
 from ..spark_codings import STEPS_8_8_8
 

@@ -26,7 +26,7 @@ from ...system.progress import Progress, silent
 from ...system.threads import blocks_of
 from .. import quantize, sh_palette, spark_codings
 from ..encoder import CLAMPED, CodeRange, Encoded, Windows, results, tally, windows_of
-from ..options import AUTO, DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
+from ..formats import AUTO, DEFAULTS, RAD_ENCODINGS, RadOptions, WriteOptions
 from ..quantize import Bytes
 from ..reader import OpenFile, Reader, comment_of
 from ..spark_codings import LARGEST_END, SCALE_ZERO, SplatEncoding
