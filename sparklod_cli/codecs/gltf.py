@@ -4,21 +4,25 @@ Profile "khronos" is the extension as it was ratified: an accessor for each attr
 what CesiumJS reads, the draft KHR_gaussian_splatting_compression_spz_2: a buffer view with an SPZ file, and accessors
 without data. Both are read and written. Facts: extensions/2.0/Khronos/ of KhronosGroup/glTF.
 
-All primitives of splats are one scene, each where the nodes with its mesh put it.
+All primitives of splats are one scene, each placed by the nodes with its mesh.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import io
+import re
 from collections import ChainMap
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 
+from ..model import MAX_SH_DEGREE
+from ..model.gaussian import normalized_quat
 from ..model.scene import Scene
-from ..model.sh import width_of
+from ..model.sh import COEFFICIENTS, notes_on_degree, width_of
 from ..model.splats import FloatArray, Splats
 from ..model.transforms import Transform
 from ..system.errors import FormatError, NotSplatsError, UnsupportedError
@@ -26,28 +30,13 @@ from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, ordered_map
 from ..system.units import count_of
 from ..system.untrusted import quoted_value
-from . import spz
+from . import quantize, spz
 from .compression import check_promise
 from .encoder import SPZ_RANGES, CodeRange
-from .formats import CESIUM, DEFAULTS, KHRONOS, WriteOptions
-from .gltf_attributes import (
-    ATTRIBUTES,
+from .formats import CESIUM, DEFAULTS, WriteOptions
+from .gltf_container import (
     COMPRESSION,
     EXTENSION,
-    OLD_COMPRESSION,
-    POINT_COLOR,
-    POSITION,
-    READ_AS_LOGS,
-    SCALE,
-    UNSIGNED,
-    Attribute,
-    are_logs,
-    attributes_of,
-    doubt_about,
-    notes_on,
-    sh_attributes,
-)
-from .gltf_container import (
     FLOAT,
     TURNS,
     TYPES,
@@ -60,15 +49,179 @@ from .gltf_container import (
     rotation_of_up,
     transform_of,
 )
-from .merging import copy_rows
+from .merging import FillMerged, Placed, copy_rows, placed
 from .reader import FileNote, OpenFile, Reader, RowBuffer, encode_rows, left_out, note_of, read_note
 
-#: Extensions that a file may require, and how those begin that change no splats: materials and lights are ignored.
+#: An extension before the current ones, of primitives, with an SPZ file as `COMPRESSION`.
+OLD_COMPRESSION = "KHR_spz_gaussian_splats_compression"
+
+#: Extensions that a file may require, and prefixes of those that change no splats: materials and lights are ignored.
 READ = (EXTENSION, COMPRESSION, OLD_COMPRESSION, "KHR_mesh_quantization")
 INDIFFERENT = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_")
 
-#: Another name for the usual colour space, in drafts of the extension, and linear colours.
+#: Written properties of the extension, the only ones that are read without a note.
+PROPERTIES = {
+    "kernel": "ellipse",
+    "colorSpace": "srgb_rec709_display",
+    "sortingMethod": "cameraDistance",
+    "projection": "perspective",
+}
+
+#: Another name of the usual colour space, in drafts of the extension, and linear colours.
 DRAFT_COLORS, LINEAR_COLORS = "BT.709-sRGB", "lin_rec709_display"
+
+#: glTF's number for primitives of points, and the target of vertex attributes.
+POINTS, ARRAY_BUFFER = 0, 34962
+
+#: Prefix of the names of attributes; "_" in the draft that CesiumJS 1.130 read.
+PREFIX, DRAFT_PREFIX = f"{EXTENSION}:", "_"
+
+#: Component types of integers.
+SIGNED, UNSIGNED = (5120, 5122), (5121, 5123)
+
+Coding = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """Attribute of a splat.
+
+    Attributes:
+        semantic: its name in the file.
+        type: type of its accessor.
+        integers: component types besides float that are read.
+        column: column of `Splats`.
+        decode, encode: conversions between values of the file and of the column.
+        term: number of the SH coefficient; None for other columns.
+        components: the first component of the accessor that belongs to the column, and the one after the last.
+    """
+
+    semantic: str
+    type: str
+    integers: tuple[int, ...]
+    column: str
+    decode: Coding = np.asarray
+    encode: Coding = np.asarray
+    term: int | None = None
+    components: tuple[int, int | None] = (0, None)
+
+    def part_of(self, splats: Splats) -> FloatArray:
+        """Return the view of the column that the attribute fills."""
+        column: FloatArray = getattr(splats, self.column)
+        return column if self.term is None else column[:, self.term]
+
+
+#: Attributes of every splat. Integers of scales are unsigned in the extension, signed in drafts of it.
+POSITION, ROTATION, SCALE, OPACITY, COLOR = ATTRIBUTES = (
+    Attribute("POSITION", "VEC3", (*SIGNED, *UNSIGNED), "center"),
+    Attribute(f"{PREFIX}ROTATION", "VEC4", SIGNED, "quat_xyzw", normalized_quat),
+    Attribute(f"{PREFIX}SCALE", "VEC3", (*SIGNED, *UNSIGNED), "scale"),
+    Attribute(f"{PREFIX}OPACITY", "SCALAR", UNSIGNED, "opacity"),
+    Attribute(f"{PREFIX}SH_DEGREE_0_COEF_0", "VEC3", (), "rgb", quantize.decode_dc, quantize.encode_dc),
+)
+
+#: Colour of points for viewers without splats. In drafts it was that of the splats, and their opacity.
+POINT_COLOR = Attribute("COLOR_0", "VEC4", UNSIGNED, "rgb", components=(0, 3))
+POINT_OPACITY = dataclasses.replace(POINT_COLOR, column="opacity", components=(3, 4))
+
+
+def sh_attributes(degree: int) -> list[Attribute]:
+    """Return the attributes of SH up to a degree, one for each coefficient."""
+    return [
+        Attribute(f"{PREFIX}SH_DEGREE_{each}_COEF_{order}", "VEC3", (), "sh", term=each * each - 1 + order)
+        for each in range(1, degree + 1)
+        for order in range(2 * each + 1)
+    ]
+
+
+def attributes_of(names: Mapping[str, Any]) -> tuple[list[Attribute], int]:
+    """Choose the attributes that splats are read from among those of a primitive; return them and the SH degree."""
+
+    def named(attribute: Attribute) -> Attribute | None:
+        for name in (attribute.semantic, attribute.semantic.replace(PREFIX, DRAFT_PREFIX)):
+            if name in names:
+                return dataclasses.replace(attribute, semantic=name)
+        draft = {OPACITY: POINT_OPACITY, COLOR: POINT_COLOR}.get(attribute)
+        return draft if draft is not None and draft.semantic in names else None
+
+    chosen = [found for each in ATTRIBUTES if (found := named(each)) is not None]
+    if len(chosen) < len(ATTRIBUTES):
+        missing = [each.semantic for each in ATTRIBUTES if named(each) is None]
+        raise FormatError(f"its splats have no {', '.join(missing)}")
+    terms = [found for each in sh_attributes(MAX_SH_DEGREE) if (found := named(each)) is not None]
+    degree = 0
+    while degree < MAX_SH_DEGREE and all(named(each) for each in sh_attributes(degree + 1)):
+        degree += 1
+    if len(terms) != COEFFICIENTS[degree]:
+        raise FormatError(f"SH of degree {degree + 1} are incomplete: {len(terms)} coefficients in all")
+    return [*chosen, *terms], degree
+
+
+#: Names of SH coefficients.
+_SH_NAME = re.compile(rf"(?:{PREFIX}|{DRAFT_PREFIX})SH_DEGREE_(\d)_COEF_\d+", re.ASCII)
+
+
+def _unread_attributes(names: Mapping[str, Any], read: Sequence[Attribute]) -> tuple[str, ...]:
+    """Return notes on the attributes of a primitive that are not read."""
+    others = [name for name in names if name not in {each.semantic for each in read}]
+    degrees = {name: int(match[1]) for name in others if (match := _SH_NAME.fullmatch(name))}
+    cut = notes_on_degree(max(degrees.values(), default=0))
+    return cut + left_out("attribute", "attributes", (name for name in others if name not in degrees))
+
+
+#: Programs that wrote logarithms in place of scales, as drafts of the extension had them until April 2026: gsbox up to
+#: version 4, and splat-transform before version 2.7, of June 2026. The extension demands linear scales.
+WRITERS = re.compile(r"gsbox v?[0-4]\.|splat-transform v?(?:1\.|2\.[0-6]\.)", re.ASCII)
+
+#: Share of splats with a scale below 0 from which on scales are logarithms, since broken files have a few; and how far
+#: below 0 half of these must be, since linear scales of mirrored splats are small. Chosen.
+NEGATIVE, BELOW = 0.1, 0.1
+
+#: Largest ratio of the 99th to the first percentile of positive values that may be logarithms. That of linear scales of
+#: real scenes is above 100, that of their logarithms below 10. Chosen.
+NARROW = 20.0
+
+#: Fewest splats of which positive values are judged. Chosen.
+LEAST = 100
+
+#: Largest linear scale as a multiple of the distance of splats; in real scenes it is 0.8 to 3 times that. Chosen.
+WIDE = 8.0
+
+READ_AS_LOGS = (
+    "its scales are logarithms, as gsbox and splat-transform before version 2.7 write them, and are read as such"
+)
+
+
+def _are_logs(scales: FloatArray, generator: object) -> bool:
+    """Return whether (n, 3) scales, sampled all over a file, are logarithms beyond doubt."""
+    if isinstance(generator, str) and WRITERS.match(generator):
+        return True
+    negative = scales[scales < 0]
+    share = float((scales < 0).any(axis=1).mean()) if len(scales) else 0.0
+    return share >= NEGATIVE and float((negative < -BELOW).mean()) >= 0.5
+
+
+def _doubt_about(scales: FloatArray, centers: FloatArray, count: int) -> str | None:
+    """Return a note on positive scales that are read as linear but may be logarithms; None if they seem linear.
+
+    Args:
+        scales, centers: (n, 3) values of splats sampled all over a file of `count` splats.
+    """
+    if count < LEAST or not (np.isfinite(scales).all() and np.isfinite(centers).all() and (scales > 0).all()):
+        return None
+    low, middle, high = np.quantile(scales.astype(np.float64), (0.01, 0.5, 0.99))
+    sides = np.sort(np.subtract(*np.quantile(centers.astype(np.float64), (0.9, 0.1), axis=0)))
+    distance = float(np.sqrt(sides[1] * sides[2] / (0.64 * count)))  # of splats on surfaces, without outliers
+    if high > NARROW * low or high - low < 1e-3 or not distance > 0 or middle < 0.1:
+        return None
+    as_scale, as_log = np.log(middle / distance), middle - np.log(distance)
+    if as_scale <= np.log(WIDE) and abs(as_log) > abs(as_scale) - 1:
+        return None
+    return (
+        f"its scales, {low:.3g} to {high:.3g}, look like logarithms, as gsbox and splat-transform before version 2.7"
+        " write them, but are read as linear ones; if they are logarithms, write the file anew by a newer version"
+    )
+
 
 #: Most primitives of splats that nodes place. Chosen.
 MAX_PARTS = 1 << 14
@@ -76,16 +229,15 @@ MAX_PARTS = 1 << 14
 #: Places of an accessor that are sampled, and values at each, to tell logarithms from scales. Chosen.
 PLACES, PLACE_ROWS = 64, 1 << 10
 
-#: Number of a mesh, and of a primitive of it; and a primitive with the transform to the scene that its node has.
+#: Number of a mesh, and of a primitive of it.
 Key = tuple[int, int]
-PlacedPrimitive = tuple[Key, Transform]
 
 
 def open_content(source: OpenFile) -> Reader:
     """Open a glTF with primitives of splats, each placed by its nodes; y is up, as glTF demands.
 
-    A file of sparklod that notes the axis which points up is read in the axes of its splats, without the turn of the
-    node that makes that axis y. In one without that note, the axis is unknown, as it was when the file was written.
+    In a file of sparklod that notes its up axis, the node turns that axis to y; it is read without that turn. If such a
+    file has no note, the axis is unknown, as it was when the file was written.
 
     Raises:
         FormatError: the file is no glTF, has no splats, uses something of glTF that is not read, or is cut short or
@@ -100,22 +252,22 @@ def open_content(source: OpenFile) -> Reader:
     parts, notes = _parts(file, primitives)
     asset = file.root.get("asset")
     asset = asset if isinstance(asset, dict) else {}
-    extras = asset.get("extras")
-    noted = read_note({**(extras if isinstance(extras, dict) else {}), "generator": asset.get("generator")})
+    extras, generator = asset.get("extras"), asset.get("generator")
+    noted = read_note({**(extras if isinstance(extras, dict) else {}), "generator": generator})
     if noted.up is not None:
         if all(is_turn_of(transform, noted.up) for _, transform in parts):
             parts = [(key, Transform()) for key, _ in parts]
         else:
             noted = FileNote(noted.antialiased, problems=noted.problems)  # another program has turned it
     up, up_by = noted.axis_of("glTF")
-    opened, contents, total = dict[Key, Reader](), list[Reader](), 0
+    opened, contents, total = dict[Key, Reader](), list[Placed](), 0
     for key, transform in parts:
         if key not in opened:
-            opened[key] = _opened(file, primitives[key], source, asset.get("generator"), alone=len(parts) == 1)
-        contents.append(placed(opened[key], transform))
-        total += contents[-1].count * 4 * width_of(contents[-1].sh_degree)
+            opened[key] = _opened(file, primitives[key], source, generator, alone=len(parts) == 1)
+        contents.append(Placed(opened[key], "", transform))
+        total += opened[key].count * 4 * width_of(opened[key].sh_degree)
         check_promise(total, file.size)
-    content = contents[0] if len(contents) == 1 else _joined(contents)
+    content = _joined(contents) if len(contents) > 1 else placed(contents[0].reader, contents[0].transform)
     check_promise(content.count * 4 * width_of(content.sh_degree), file.size)
     return dataclasses.replace(
         content,
@@ -125,6 +277,19 @@ def open_content(source: OpenFile) -> Reader:
         header=ChainMap({"bytes": file.size}, cast("dict[str, int]", content.header)),  # to which reading adds
         up=up,
         up_by=up_by,
+    )
+
+
+def _joined(parts: Sequence[Placed]) -> Reader:
+    """Join several primitives to one scene; SH coefficients that a primitive does not have become 0."""
+    readers = [part.reader for part in parts]
+    return Reader(
+        sum(reader.count for reader in readers),
+        max(reader.sh_degree for reader in readers),
+        readers[0].format,
+        FillMerged(tuple(parts)),
+        any(reader.antialiased for reader in readers),
+        tuple(note for reader in readers for note in reader.notes),
     )
 
 
@@ -143,43 +308,41 @@ def _primitives(file: GltfFile) -> dict[Key, dict[str, Any]]:
 
 
 def _extensions(record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the extensions of an object of the JSON whose values are objects, too."""
+    """Return the extensions of an object of the JSON that are objects themselves."""
     found = record.get("extensions")
     return {name: each for name, each in found.items() if isinstance(each, dict)} if isinstance(found, dict) else {}
 
 
-def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[list[PlacedPrimitive], list[str]]:
-    """Return the placed primitives, and notes on the rest of the file, which is left out."""
+def _parts(file: GltfFile, primitives: Mapping[Key, dict[str, Any]]) -> tuple[list[tuple[Key, Transform]], list[str]]:
+    """Place primitives by their nodes; return them with their transforms, and notes on everything left out."""
     nodes, by_mesh, notes = GltfNodes(file), dict[int, list[Key]](), list[str]()
     for key in primitives:
         by_mesh.setdefault(key[0], []).append(key)
     having, hidden = nodes.having(by_mesh)
-    if max(len(primitives), sum(len(by_mesh[nodes.records[node]["mesh"]]) for node in having)) > MAX_PARTS:
+    placing = [nodes.records[node] for node in having]
+    if max(len(primitives), sum(len(by_mesh[record["mesh"]]) for record in placing)) > MAX_PARTS:
         raise UnsupportedError(f"it has more than {MAX_PARTS:,} primitives of splats, counted once for each node")
-    parts, unknown = list[PlacedPrimitive](), dict[str, None]()
-    for node in having:
-        record = nodes.records[node]
+    parts = list[tuple[Key, Transform]]()
+    for node, record in zip(having, placing, strict=True):
         transform = transform_of(nodes.matrix(node))
         parts += [(key, transform) for key in by_mesh[record["mesh"]]]
-        unknown |= dict.fromkeys(_extensions(record))
     if hidden:
         notes.append(f"left out: {count_of(hidden, 'node')} with splats outside of the scene that viewers show")
-    unplaced = len(by_mesh) - len({nodes.records[node]["mesh"] for node in having})
+    unplaced = len(by_mesh) - len({record["mesh"] for record in placing})
     if having and unplaced:
         notes.append(f"left out: {count_of(unplaced, 'mesh', 'meshes')} of splats that no node places")
     others = sum(len(mesh["primitives"]) for mesh in file.items("meshes") if isinstance(mesh.get("primitives"), list))
-    others -= len(primitives)
-    if others:
-        notes.append(f"left out: {count_of(others, 'primitive')} without splats")
+    if others > len(primitives):
+        notes.append(f"left out: {count_of(others - len(primitives), 'primitive')} without splats")
     if file.root.get("animations"):
         notes.append("left out: its animations")
     if any(primitive.get("targets") for primitive in primitives.values()):
         notes.append("left out: the morph targets of its splats")
-    for primitive in primitives.values():
-        unknown |= dict.fromkeys([*_extensions(primitive), *_extensions(_extensions(primitive).get(EXTENSION, {}))])
-    notes += left_out(
-        "extension", "extensions", (name for name in unknown if name not in READ and not name.startswith(INDIFFERENT))
-    )
+    own = [_extensions(primitive) for primitive in primitives.values()]
+    inner = [_extensions(each.get(EXTENSION, {})) for each in own]
+    names = (name for each in (*map(_extensions, placing), *own, *inner) for name in each)
+    unread = (name for name in names if name not in READ and not name.startswith(INDIFFERENT))
+    notes += left_out("extension", "extensions", unread)
     return parts or [(key, Transform()) for key in primitives], notes
 
 
@@ -220,26 +383,22 @@ def _plain_content(file: GltfFile, primitive: dict[str, Any], generator: object)
     count = accessors[0][1].count
     if any(accessor.count != count for _, accessor in accessors):
         raise FormatError(f"its attributes have different numbers of values, not all {count:,}")
-    notes = list(notes_on(names, attributes))
-    scales, centers = (
-        _sampled(file, accessor)
-        for wanted in (SCALE, POSITION)
-        for each, accessor in accessors
-        if each.column == wanted.column
-    )
-    if are_logs(scales, generator):
+    notes = list(_unread_attributes(names, attributes))
+    by_column = {each.column: accessor for each, accessor in accessors}
+    scales, centers = (_sampled(file, by_column[each.column]) for each in (SCALE, POSITION))
+    if _are_logs(scales, generator):
         notes.append(READ_AS_LOGS)
         accessors = [
             (dataclasses.replace(each, decode=np.exp) if each.column == SCALE.column else each, accessor)
             for each, accessor in accessors
         ]
-    elif doubt := doubt_about(scales, centers, count):
+    elif doubt := _doubt_about(scales, centers, count):
         notes.append(doubt)
 
     def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         with file.readers({accessor.buffer for _, accessor in accessors}) as readers:
 
-            @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
+            @np.errstate(over="ignore", invalid="ignore")  # callers check the numbers
             def read(item: tuple[slice, Attribute, Accessor]) -> slice:
                 part, attribute, accessor = item
                 out = attribute.part_of(target.splats)[part]
@@ -255,7 +414,7 @@ def _plain_content(file: GltfFile, primitive: dict[str, Any], generator: object)
 
 
 def _sampled(file: GltfFile, accessor: Accessor) -> FloatArray:
-    """Return values from all over an accessor."""
+    """Read a sample of values from all over an accessor."""
     rows = min(PLACE_ROWS, accessor.count)
     starts = sorted({(accessor.count - rows) * place // (PLACES - 1) for place in range(PLACES)}) if rows else []
     with file.readers([accessor.buffer]) as readers, np.errstate(over="ignore", invalid="ignore"):
@@ -264,7 +423,7 @@ def _sampled(file: GltfFile, accessor: Accessor) -> FloatArray:
 
 
 def _reopened(opened: Callable[[], Reader]) -> Reader:
-    """Return a content that decodes all splats at the first read, and keeps them until the last row was read."""
+    """Return a reader that decodes all splats at the first read, and keeps them until it has read the last row."""
     content, held = opened(), list[Splats]()
 
     def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
@@ -279,67 +438,13 @@ def _reopened(opened: Callable[[], Reader]) -> Reader:
     return dataclasses.replace(content, fill=fill)
 
 
-def _joined(contents: Sequence[Reader]) -> Reader:
-    """Return the splats of several contents as one; SH coefficients that one does not have become 0."""
-    degree = max(content.sh_degree for content in contents)
-
-    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
-        done = 0
-        for number, part, rows in target.shares(content.count for content in contents):
-            content = contents[number]
-            own = rows if content.sh_degree == degree else Splats.empty(len(rows), content.sh_degree)
-            content.fill(RowBuffer(own, part.start, columns=target.columns), threads, silent)
-            if own is not rows:
-                copy_rows(own, rows)
-            done += len(rows)
-            progress("reading", done, len(target.splats), "splat")
-
-    first, notes = contents[0], [note for content in contents for note in content.notes]
-    antialiased = any(content.antialiased for content in contents)
-    return Reader(sum(content.count for content in contents), degree, first.format, fill, antialiased, tuple(notes))
-
-
-def placed(content: Reader, transform: Transform) -> Reader:
-    """Return the content with its splats transformed as they are read; its `up` is that of the transformed ones."""
-    if transform.is_identity:
-        return content
-    axes = ("center", "scale", "quat_xyzw", "sh")
-
-    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
-        content.fill(target, threads, progress)
-        turned = transform.apply(target.splats)
-        for name in axes:
-            column = getattr(target.splats, name)
-            if getattr(turned, name) is not column:
-                column[...] = getattr(turned, name)
-
-    return dataclasses.replace(content, fill=fill)
-
-
-#: glTF's number for primitives of points, and the target of vertex attributes.
-POINTS, ARRAY_BUFFER = 0, 34962
-
-#: What the values of the extension mean, as they are written.
-PROPERTIES = {
-    "kernel": "ellipse",
-    "colorSpace": "srgb_rec709_display",
-    "sortingMethod": "cameraDistance",
-    "projection": "perspective",
-}
-
-
-def profile_of(options: WriteOptions) -> str:
-    """Return the profile that is written, `KHRONOS` unless an option names another."""
-    return options.glb_profile or KHRONOS
-
-
-def extensions_of(profile: str) -> list[str]:
+def extensions_of(profile: str | None) -> list[str]:
     """Return the extensions of glTF that the files of a profile use."""
     return [EXTENSION, COMPRESSION] if profile == CESIUM else [EXTENSION]
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """Return the options with nothing left open, those of SPZ, too, which the profile "cesium" has inside.
+    """Return the options with nothing left open, also those of the SPZ in the profile "cesium".
 
     Raises:
         FormatError: the scene is a tree, has an opacity above 1, which glTF forbids, or does not fit.
@@ -350,21 +455,21 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     most = float(splats.opacity.max(initial=0))
     if most > 1:
         raise FormatError(f"GLB holds no opacity above 1, and a splat has {most:g}; extract the leaves, or simplify")
-    if profile_of(options) == CESIUM:
+    if options.glb_profile == CESIUM:
         return spz.settled(scene, options)
     check_length(4 * len(splats) * (14 + 3 * splats.sh.shape[1]) + (1 << 16))
     return options
 
 
 def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
-    """Return the values that the profile holds without clamping them: all, or those of SPZ."""
-    return SPZ_RANGES if profile_of(options) == CESIUM else ()
+    """Return the ranges of values that a profile clamps: those of SPZ, or none."""
+    return SPZ_RANGES if options.glb_profile == CESIUM else ()
 
 
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """Return the bytes of a GLB, piece by piece; its root node turns the axis that points up, where known, to y.
+    """Encode a GLB piece by piece; its root node turns the up axis, if known, to y.
 
     The same scene and options give the same bytes for any number of threads.
 
@@ -372,20 +477,26 @@ def encode(
         FormatError: see `settled`.
     """
     options = settled(scene, options)
-    yield from (_encode_spz if profile_of(options) == CESIUM else _encode_plain)(scene, options, threads, progress)
-
-
-def _encode_plain(scene: Scene, options: WriteOptions, threads: int, progress: Progress) -> Iterator[bytes]:
     splats, count = scene.splats, len(scene.splats)
+    if options.glb_profile == CESIUM:
+        plain = dataclasses.replace(scene, up=None)  # `asset` notes the axis
+        data = b"".join(spz.encode(plain, options, threads=threads, progress=progress))
+        attributes = [POSITION, POINT_COLOR, SCALE, ROTATION, *sh_attributes(splats.sh_degree)]
+        accessors = [_accessor(each, splats) for each in attributes]
+        accessors[1] |= {"componentType": UNSIGNED[0], "normalized": True}  # as CesiumJS unpacks colours and opacities
+        views = [{"buffer": 0, "byteOffset": 0, "byteLength": len(data)}]
+        data += bytes(-len(data) % 4)
+        yield _head(scene, attributes, accessors, views, len(data), cesium=True)
+        yield data
+        return
     attributes = [*ATTRIBUTES, *sh_attributes(splats.sh_degree)]
     views, accessors, offset = [], [], 0
     for number, each in enumerate(attributes):
-        size = TYPES[each.type]
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": 4 * size * count, "target": ARRAY_BUFFER})
-        accessors.append({"bufferView": number, **_accessor(each.type, count), **_bounds(each, splats)})
-        offset += 4 * size * count
-    root = _root(scene, attributes, accessors, views, offset, PROPERTIES, required=False)
-    yield head_of(root, offset)
+        size = 4 * TYPES[each.type] * count
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, "target": ARRAY_BUFFER})
+        accessors.append({"bufferView": number, **_accessor(each, splats)})
+        offset += size
+    yield _head(scene, attributes, accessors, views, offset, cesium=False)
     for each in attributes:
         column = each.part_of(splats)
 
@@ -395,74 +506,51 @@ def _encode_plain(scene: Scene, options: WriteOptions, threads: int, progress: P
         yield from encode_rows(rows, count, threads, progress)
 
 
-def _encode_spz(scene: Scene, options: WriteOptions, threads: int, progress: Progress) -> Iterator[bytes]:
-    # The axis that points up is noted in `asset`.
-    plain = dataclasses.replace(scene, up=None)
-    data = b"".join(spz.encode(plain, options, threads=threads, progress=progress))
-    splats, count = scene.splats, len(scene.splats)
-    position, rotation, scale, *_ = ATTRIBUTES
-    color = Attribute(POINT_COLOR, "VEC4", UNSIGNED, "rgb")
-    attributes = [position, color, scale, rotation, *sh_attributes(splats.sh_degree)]
-    accessors = [{**_accessor(each.type, count), **_bounds(each, splats)} for each in attributes]
-    accessors[1] |= {"componentType": UNSIGNED[0], "normalized": True}  # as CesiumJS unpacks colours and opacities
-    views = [{"buffer": 0, "byteOffset": 0, "byteLength": len(data)}]
-    properties = {**PROPERTIES, "extensions": {COMPRESSION: {"bufferView": 0}}}
-    padding = bytes(-len(data) % 4)
-    root = _root(scene, attributes, accessors, views, len(data) + len(padding), properties, required=True)
-    yield head_of(root, len(data) + len(padding))
-    yield data + padding
+def _accessor(attribute: Attribute, splats: Splats) -> dict[str, Any]:
+    """Describe an attribute; positions need bounds, whose float32 values JSON holds to the last bit."""
+    accessor = {"componentType": FLOAT, "count": len(splats), "type": attribute.type}
+    if attribute is not POSITION or not len(splats):
+        return accessor
+    return accessor | {"min": splats.center.min(axis=0).tolist(), "max": splats.center.max(axis=0).tolist()}
 
 
-def _accessor(kind: str, count: int) -> dict[str, Any]:
-    return {"componentType": FLOAT, "count": count, "type": kind}
-
-
-def _bounds(attribute: Attribute, splats: Splats) -> dict[str, Any]:
-    """Return the bounds of positions, which glTF demands; JSON has their float32 values to the last bit."""
-    if attribute.column != "center" or not len(splats):
-        return {}
-    return {"min": splats.center.min(axis=0).tolist(), "max": splats.center.max(axis=0).tolist()}
-
-
-def _root(
+def _head(
     scene: Scene,
     attributes: Sequence[Attribute],
     accessors: list[dict[str, Any]],
     views: list[dict[str, Any]],
     length: int,
-    properties: dict[str, Any],
     *,
-    required: bool,
-) -> dict[str, Any]:
+    cesium: bool,
+) -> bytes:
+    """Encode everything before `length` bytes of content."""
     note = note_of(antialiased=scene.antialiased, up=scene.up)
     asset = {"version": "2.0", "generator": note.pop("generator")} | ({"extras": note} if note else {})
-    extensions = extensions_of(CESIUM if required else KHRONOS)
-    return {
+    extensions = extensions_of(CESIUM if cesium else None)
+    primitive = {
+        "attributes": {each.semantic: number for number, each in enumerate(attributes)},
+        "mode": POINTS,
+        "extensions": {
+            EXTENSION: PROPERTIES | ({"extensions": {COMPRESSION: {"bufferView": 0}}} if cesium else {}),
+        },
+    }
+    root = {
         "asset": asset,
         "extensionsUsed": extensions,
-        **({"extensionsRequired": extensions} if required else {}),
+        **({"extensionsRequired": extensions} if cesium else {}),
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0} | _turn(scene.up, as_matrix=required)],
-        "meshes": [
-            {
-                "primitives": [
-                    {
-                        "attributes": {each.semantic: number for number, each in enumerate(attributes)},
-                        "mode": POINTS,
-                        "extensions": {EXTENSION: properties},
-                    }
-                ]
-            }
-        ],
+        "nodes": [{"mesh": 0} | _turn(scene.up, as_matrix=cesium)],
+        "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": length}],
     }
+    return head_of(root, length)
 
 
 def _turn(up: str | None, *, as_matrix: bool) -> dict[str, Any]:
-    """Return the turn of a node that makes an axis y. As content of a tile, CesiumJS reads nothing but a matrix."""
+    """Return the turn of a node that makes an axis y. In the content of a tile, CesiumJS reads nothing but a matrix."""
     if as_matrix:
         matrix = np.eye(4)
         matrix[:3, :3] = rotation_of_up(up)

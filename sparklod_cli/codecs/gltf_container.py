@@ -31,6 +31,9 @@ from ..system.untrusted import Json, Origin, quoted_value
 from .format_rules import leads_away
 from .reader import OpenFile, size_of
 
+#: Extensions of splats: plain, and with SPZ inside.
+EXTENSION, COMPRESSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
+
 #: The header of a binary file, magic, version and length, and of a chunk, length and type.
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAGIC, VERSION = b"glTF", 2

@@ -24,11 +24,23 @@ from .reader import Fill, OpenCompanion, OpenFile, Reader, RowBuffer
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A scene, its name in messages, and the transform of its splats."""
+    """Scene, its name in messages, empty for none, and the transform of its splats."""
 
     reader: Reader
     name: str
     transform: Transform = field(default_factory=Transform)
+
+
+def placed(reader: Reader, transform: Transform) -> Reader:
+    """Return a reader that transforms splats as it reads them; its `up` is that of the transformed splats."""
+    if transform.is_identity:
+        return reader
+
+    def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
+        reader.fill(target, threads, progress)
+        copy_rows(transform.apply(target.splats), target.splats)
+
+    return replace(reader, fill=fill)
 
 
 def merged(parts: Sequence[Placed]) -> Reader:
@@ -47,7 +59,7 @@ def merged(parts: Sequence[Placed]) -> Reader:
         sum(part.reader.count for part in parts),
         degree,
         " and ".join(sorted({part.reader.format for part in parts})),
-        _FillMerged(tuple(parts)),
+        FillMerged(tuple(parts)),
         antialiased,
         tuple(dict.fromkeys(notes)),
         up=common_axis(axes),
@@ -70,7 +82,7 @@ def _antialiased(parts: Sequence[Placed]) -> tuple[bool, tuple[str, ...]]:
 
 
 @dataclass(frozen=True, eq=False)
-class _FillMerged:
+class FillMerged:
     """`Reader.fill` of several scenes, in the memory of a block; can be pickled if their readers can."""
 
     parts: tuple[Placed, ...]
@@ -79,8 +91,8 @@ class _FillMerged:
         done = 0
         for number, rows, out in target.shares(part.reader.count for part in self.parts):
             part, at = self.parts[number], 0
-            with naming(part.name):
-                for splats in part.reader.blocks(rows.start, rows.stop):
+            with naming(part.name) if part.name else contextlib.nullcontext():
+                for splats in replace(part.reader, threads=threads).blocks(rows.start, rows.stop):
                     copy_rows(part.transform.apply(splats), out.take(slice(at, at := at + len(splats))))
                     done += len(splats)
                     progress("reading", done, len(target.splats), "splat")

@@ -29,7 +29,7 @@ from .compression import check_promise
 from .format_rules import check_rules, error_of
 from .formats import CESIUM, TILES, TILESET, WriteOptions
 from .gltf_container import transform_of
-from .merging import Chunk, SceneFiles
+from .merging import Chunk, SceneFiles, placed
 from .reader import Note, OpenCompanion, OpenFile, Reader, note_of
 from .tileset import (
     CONTENT_GLTF,
@@ -189,7 +189,7 @@ def tile_files(open_companion: OpenCompanion | None, matrices: dict[str, Matrix]
             return content
         turn = np.eye(4)
         turn[:3, :3] = to_tileset(content.up)
-        return gltf.placed(content, transform_of(turn.T @ matrix @ turn))
+        return placed(content, transform_of(turn.T @ matrix @ turn))
 
     return SceneFiles(open_companion, TILESET, "tiles.files", open_tile)
 
@@ -285,7 +285,7 @@ def box_of(corners: Any) -> list[float]:
 
 def _tileset(scene: TileScene, options: WriteOptions, root: JsonObject, error: float) -> JsonObject:
     """Return a tileset; `error` is its geometric error where none of it is drawn."""
-    extensions = gltf.extensions_of(options.glb_profile or CESIUM)
+    extensions = gltf.extensions_of(options.glb_profile)
     return {
         "asset": {"version": VERSION, "extras": note_of(antialiased=scene.antialiased, up=scene.up)},
         "geometricError": error,

@@ -37,8 +37,7 @@ from .format_rules import (
     violation,
 )
 from .formats import TILESET
-from .gltf_attributes import COMPRESSION, EXTENSION
-from .gltf_container import product, rotation_of_up
+from .gltf_container import COMPRESSION, EXTENSION, product, rotation_of_up
 from .merging import Chunk, SceneFiles, not_finite
 from .reader import FileNote, OpenCompanion, read_note
 

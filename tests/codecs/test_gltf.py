@@ -18,7 +18,7 @@ import pytest
 from fixtures import by_hand_glb
 from sparklod_cli.codecs import gltf, gltf_container
 from sparklod_cli.codecs.formats import PROFILES, WriteOptions
-from sparklod_cli.codecs.gltf_attributes import READ_AS_LOGS
+from sparklod_cli.codecs.gltf import READ_AS_LOGS
 from sparklod_cli.codecs.gltf_container import TURNS
 from sparklod_cli.codecs.reader import OpenFile
 from sparklod_cli.inspection.report import ReportSettings, inspect
