@@ -27,8 +27,8 @@ from ..system.threads import blocks_of, ordered_map
 from ..system.untrusted import quoted, quoted_value
 from . import quantize
 from .formats import ZIP
+from .merging import ZIP_ERRORS
 from .reader import HARMLESS, OpenFile, Reader, RowBuffer, left_out
-from .zip_folder import ZIP_ERRORS
 
 #: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
 MOST_PICKLE = 1 << 24

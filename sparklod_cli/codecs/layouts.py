@@ -33,9 +33,9 @@ from ..system.threads import for_blocks
 from ..system.units import count_of
 from ..system.untrusted import quoted, quoted_value
 from . import quantize, spark_codings
+from .merging import ZIP_ERRORS
 from .spark_codings import DEFAULT, STEPS_8_8_8, STEPS_10_10_12, SplatEncoding, Words
 from .spark_nodes import Nodes
-from .zip_folder import ZIP_ERRORS
 
 Arrays = dict[str, NDArray[Any]]
 

@@ -34,6 +34,7 @@ from . import sog_images as codings
 from .compression import check_promise
 from .formats import DEFAULTS, MAX_SH_CODES, META, SOG_IMAGES, WriteOptions
 from .kernels import texels
+from .merging import ZipFolder
 from .reader import Note, OpenCompanion, OpenFile, Reader, RowBuffer, note_of, read_note, size_of
 from .sog_images import (
     MAX_SIDE,
@@ -47,7 +48,6 @@ from .sog_images import (
     pixels_of,
     read_header,
 )
-from .zip_folder import ZipFolder
 
 # Files of a scene: meta.json and images, in a zip or a folder. Sizes are checked before decoding.
 

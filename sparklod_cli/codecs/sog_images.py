@@ -19,7 +19,7 @@ from ..model.splats import FloatArray
 from ..system.errors import FormatError
 from ..system.untrusted import quoted_value
 from . import quantize
-from .zip_folder import PIECE
+from .merging import PIECE
 
 Bytes = NDArray[np.uint8]
 Words = NDArray[np.uint16]

@@ -140,7 +140,7 @@ def open_splats(
         raise unknown_format(head, path)
     open_companion: OpenCompanion = functools.partial(open_named, path, folders=form.folders)
     if head.startswith(ZIP) and form.companions:
-        from ..codecs.zip_folder import ZipFolder  # what most files do without
+        from ..codecs.merging import ZipFolder  # what most files do without
 
         folder = ZipFolder(file)
         file.seek(0)

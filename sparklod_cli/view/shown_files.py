@@ -26,13 +26,13 @@ from ..codecs.formats import META, ZIP, head_of, sniff
 from ..codecs.gltf import open_content as open_glb
 from ..codecs.gltf_container import MAGIC as GLB_MAGIC
 from ..codecs.losses import MOST_PAGED_DEGREE, sample_loss
+from ..codecs.merging import ZipFolder
 from ..codecs.rad.rad_header import CHUNK_MAGIC, MAGIC, RadHeader, read_header
 from ..codecs.rad.rad_reader import RadReader
 from ..codecs.reader import OpenFile
 from ..codecs.streamed_manifest import MAX_MANIFEST, files_of_chunk, parse
 from ..codecs.tiles_3d import names_of
 from ..codecs.tileset import MAX_TILESET
-from ..codecs.zip_folder import ZipFolder
 from ..io.files import check_companion, in_folder, open_named, open_plain, reason_unreadable, unknown_format
 from ..io.reading import read_parts, read_scene
 from ..model.instances import DetailScene, TileScene

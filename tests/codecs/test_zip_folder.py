@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sparklod_cli.cli import run
+from sparklod_cli.codecs.merging import ZipFolder
 from sparklod_cli.codecs.streamed_manifest import parse
-from sparklod_cli.codecs.zip_folder import ZipFolder
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.system.errors import FormatError, NotSplatsError
 from sparklod_cli.viewers.playcanvas import read_detail_files
