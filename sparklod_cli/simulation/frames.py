@@ -1,4 +1,4 @@
-"""`Simulation`, the frames of a viewer along a camera path; and `Loader`, visitors who wait while a page loads."""
+"""Frames of a viewer along a camera path (`Simulation`), and waits of visitors while a page loads (`Loader`)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +27,30 @@ from ..viewers.viewer_settings import LodSettings, StreamingSettings, pixel_limi
 from .results import COLUMNS, LOADING, OF_BUDGETS, OF_TREES, Extremes, FrameOutputs, Moment, add_extremes, moments_of
 
 
-class StreamedCuts(CutFinder):
-    """Cuts of a viewer that fetches the chunks of scenes, for one camera after another; never continuous ones.
+class SimulatedFrame(NamedTuple):
+    """One frame.
 
-    Scenes without cuts are there from the beginning. Without `streaming` everything is resident.
+    Attributes:
+        number: of the frame on the path.
+        resident: (chunks,) bool, of all scenes, the chunks that the cut was found with.
+        rows: the row of all instances together, then one per instance, if requested.
+    """
+
+    number: int
+    camera: Camera
+    cut: TreeCut
+    resident: NDArray[np.bool_]
+    rows: list[Row]
+
+
+#: Nodes per row of Spark's index texture.
+ROW = 16_384
+
+
+class Simulation(CutFinder):
+    """A viewer that fetches the chunks of scenes, for one camera after another; its cuts are never continuous.
+
+    Scenes without cuts are resident from the beginning. Without `streaming` everything is.
 
     Raises:
         UnfitError: the budget, or the cache, is too small for the roots; or there are too many instances.
@@ -38,7 +58,8 @@ class StreamedCuts(CutFinder):
 
     settings: LodSettings
     viewer: Viewer
-    remembers = False
+    #: Whether cuts are found along a path, each beginning with what the one before it drew.
+    remembers = True
 
     def __init__(self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings | None = None) -> None:
         self.streaming = streaming or StreamingSettings()
@@ -51,43 +72,14 @@ class StreamedCuts(CutFinder):
             fetchers=held[0].fetchers,
             connections=held[0].connections,
         )
-        ChunkCache(self.chunks, self.streaming.chunk_cache)  # raises what would fail later
-
-
-@dataclass(frozen=True)
-class SimulatedFrame:
-    """One frame.
-
-    Attributes:
-        number: number of the frame on the path.
-        resident: (chunks,) bool, of all trees, the chunks that the cut was found with.
-        rows: the row of all instances together, then one per instance, if requested.
-        in_front: share of the drawn splats in front of the camera.
-    """
-
-    number: int
-    camera: Camera
-    cut: TreeCut
-    resident: NDArray[np.bool_]
-    rows: list[Row]
-    in_front: float
-
-
-#: Nodes per row of Spark's index texture.
-ROW = 16_384
-
-
-class Simulation(StreamedCuts):
-    """A viewer that moves along a camera path through scenes that all have cuts."""
-
-    remembers = True
+        ChunkCache(self.chunks, self.streaming.chunk_cache)  # raises the errors of a cache that is too small
 
     def run(
         self, path: CameraPath, *, by_instance: bool = False, threads: int = 1, progress: Progress = silent
     ) -> Iterator[SimulatedFrame]:
-        """Yield the frames of a path, in order; with `by_instance` also the rows of single instances.
+        """Yield the frames of a path through scenes that all have cuts; `by_instance` adds rows of single instances.
 
-        Cuts are found on several threads, some frames ahead; anything that depends on the previous frame is done in
+        Cuts are found on several threads, some frames ahead; all else depends on the previous frame and is computed in
         order. If chunks are missing, the cut is found again with the resident ones.
         """
         cache, stream = ChunkCache(self.chunks, self.streaming.chunk_cache), None
@@ -96,7 +88,7 @@ class Simulation(StreamedCuts):
             stream = ChunkStream(self.chunks, network, capacity=self.streaming.chunk_cache, start=start)
             cache = stream.cache
         changes = Changes(self.viewer.forest, self.viewer.instances)
-        # Loads or compiles the kernels, so that the time of the first frame does not include it.
+        # Loads or compiles the kernels now, so that the time of the first frame does not include it.
         self.viewer.cut(path.cameras[0], budget=len(self.viewer.instances))
         found = ordered_map(functools.partial(self._find, by_instance=by_instance), path.cameras, threads)
         for at, (number, camera, ideal) in enumerate(zip(path.numbers, path.cameras, found, strict=True)):
@@ -106,13 +98,11 @@ class Simulation(StreamedCuts):
             drawn, resident, cells = self._fetched(camera, ideal, cache, stream, headers)
             rows = self._rows(number, camera, drawn, changes.next(drawn[0]))
             rows[0] |= cells
-            whole = drawn[1]
-            in_front = 1 - whole.behind / whole.selected if whole.selected else 1.0
             if self.scenes.kind != TREE:
                 none = (*OF_TREES, *(OF_BUDGETS if self.scenes.kind == TILES else ()))
                 rows = [row | dict.fromkeys(none) for row in rows]
             rows = [{column.name: column.rounded(row.get(column.name)) for column in COLUMNS} for row in rows]
-            yield SimulatedFrame(number, camera, drawn[0], resident, rows, in_front)
+            yield SimulatedFrame(number, camera, drawn[0], resident, rows)
             progress("traverse", at + 1, len(path.cameras), "frame")
 
     def _find(self, camera: Camera, resident: NDArray[np.bool_] | None = None, *, by_instance: bool) -> MeasuredCut:
@@ -125,7 +115,7 @@ class Simulation(StreamedCuts):
         """Return the cut with the resident chunks, these chunks, and the cells of the row that describe chunks.
 
         Without a stream there is no network: all chunks that fit the cache arrive at once. `headers` is the number of
-        bytes received before the first chunk.
+        bytes of headers that are received with this frame.
         """
         requested, arrived, received, complete_in = ideal[0].wanted(), list[int](), headers, None
         if stream is None:
@@ -135,7 +125,7 @@ class Simulation(StreamedCuts):
             for chunk in arrived:
                 cache.arrive(chunk)
         drawn, resident = ideal, cache.resident()
-        # What is drawn of detail levels depends on what was drawn before, as long as files are missing.
+        # Detail levels depend on those of the previous frame, as long as files are missing.
         if not resident[requested].all() or (self.scenes.kind == STREAMED_SOG and stream is not None):
             drawn = self._find(camera, resident, by_instance=bool(ideal[2]))
         if stream is not None:
@@ -176,12 +166,8 @@ class Simulation(StreamedCuts):
             if retained is not None:
                 added, removed = selected - retained, before - retained
                 churn = (added + removed) / (selected + before) if selected + before else 0.0
-            cells = {"added": added, "removed": removed, "churn": churn}
-            cells |= {
-                "interior": measured.selected - measured.leaves,
-                "budget_used": measured.selected / settings.budget,
-            }
-            rows.append(where | {"instance": name} | vars(measured) | cells)
+            cells = {"added": added, "removed": removed, "churn": churn, "budget_used": selected / settings.budget}
+            rows.append(where | {"instance": name} | measured | cells)
         rows[0] |= {
             "stop_reason": cut.reason,
             "pixel_scale_min": cut.least,
@@ -209,12 +195,11 @@ def write_frames(
         the row of all instances together for each frame; the mean share of the drawn splats in front of the camera; and
         why the charts have no picture of the path, None if they have one, or if there are no charts.
     """
-    together, in_front, most = list[Row](), list[float](), Extremes()
+    together, most = list[Row](), Extremes()
     extremes: dict[str, SimulatedFrame] = {}  # by criterion, and the first frame
 
     def rows() -> Iterator[Row]:
         for frame in simulation.run(path, by_instance=by_instance, threads=threads, progress=progress):
-            in_front.append(frame.in_front)
             if outputs.indices is not None:
                 _write_indices(frame, outputs)
             if outputs.plot is not None:
@@ -229,7 +214,8 @@ def write_frames(
     if outputs.plot is not None:
         png, note = _charts(simulation, path, together, moments_of(most), extremes)
         write_file(outputs.plot, [png], overwrite=outputs.overwrite)
-    return together, float(np.mean(in_front)), note
+    drawn = [(cast("int", row["behind"]), cast("int", row["selected"])) for row in together]
+    return together, float(np.mean([1 - behind / selected if selected else 1.0 for behind, selected in drawn])), note
 
 
 def _write_indices(frame: SimulatedFrame, outputs: FrameOutputs) -> None:
@@ -267,35 +253,16 @@ def _charts(
     return charts.plot(rows, marked, simulation.scenes.title, scene)
 
 
-@dataclass(frozen=True)
-class CutStatistics:
-    """Statistics of a cut, or of one instance's nodes in it: columns that `simulation.results.COLUMNS` describes.
-
-    Levels are None if no node is selected, projected sizes if none is inside the frustum.
-    """
-
-    selected: int
-    leaves: int
-    frontier: int
-    in_frustum: int
-    outside: int
-    behind: int
-    level_min: int | None
-    level_mean: float | None
-    level_max: int | None
-    projected_px_p50: float | None
-    projected_px_p95: float | None
-    overdraw_estimate: float
-
-
 #: A cut with its statistics, as a whole and by instance.
-MeasuredCut = tuple[TreeCut, CutStatistics, list[CutStatistics]]
+MeasuredCut = tuple[TreeCut, Row, list[Row]]
 
 
-def measure(
-    forest: Forest, cut: TreeCut, view: Camera, *, by_instance: bool = False
-) -> tuple[CutStatistics, list[CutStatistics]]:
-    """Return the statistics of a cut found for `view` as a whole and, optionally, of each instance in it."""
+def measure(forest: Forest, cut: TreeCut, view: Camera, *, by_instance: bool = False) -> tuple[Row, list[Row]]:
+    """Return the statistics of a cut found for `view` as a whole and, optionally, of each instance in it.
+
+    They are cells of `simulation.results.COLUMNS`. Levels are None if no node is selected, projected sizes if none is
+    inside the frustum.
+    """
     pixels = view.width * view.height
     counts = np.empty((len(cut.views), kernels.COUNTS), np.int64)
     sizes, owners = np.empty(len(cut.node), np.float32), np.empty(len(cut.node), np.uint16)
@@ -319,9 +286,9 @@ def measure(
     return whole, [_measured(row, part, pixels) for row, part in zip(counts, parts, strict=True)]
 
 
-def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -> CutStatistics:
-    count = [int(value) for value in row]
-    selected = count[kernels.SELECTED]
+def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -> Row:
+    """Return the statistics of a row of counts, `kernels.COUNTS`, and of the projected sizes of its splats."""
+    selected, leaves, frontier, in_frustum, outside, behind, least, levels, most, area = row.tolist()
     percentiles: list[float | None] = [None, None]
     if len(sizes):  # interpolated linearly between two sizes each
         places = [share * (len(sizes) - 1) for share in (0.50, 0.95)]
@@ -332,20 +299,21 @@ def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -
             below + (at - int(at)) * (above - below) if above > below else below  # both may be infinite
             for at, (below, above) in zip(places, found.tolist(), strict=True)
         ]
-    return CutStatistics(
-        selected=selected,
-        leaves=count[kernels.LEAVES],
-        frontier=count[kernels.FRONTIER],
-        in_frustum=count[kernels.IN_FRUSTUM],
-        outside=count[kernels.OUTSIDE],
-        behind=count[kernels.BEHIND],
-        level_min=count[kernels.DEPTH_MIN] if selected else None,
-        level_mean=count[kernels.DEPTH_SUM] / selected if selected else None,
-        level_max=count[kernels.DEPTH_MAX] if selected else None,
-        projected_px_p50=percentiles[0],
-        projected_px_p95=percentiles[1],
-        overdraw_estimate=count[kernels.AREA] / kernels.AREA_PARTS / pixels,
-    )
+    return {
+        "selected": selected,
+        "leaves": leaves,
+        "interior": selected - leaves,
+        "frontier": frontier,
+        "in_frustum": in_frustum,
+        "outside": outside,
+        "behind": behind,
+        "level_min": least if selected else None,
+        "level_mean": levels / selected if selected else None,
+        "level_max": most if selected else None,
+        "projected_px_p50": percentiles[0],
+        "projected_px_p95": percentiles[1],
+        "overdraw_estimate": area / kernels.AREA_PARTS / pixels,
+    }
 
 
 class Changes:
@@ -353,13 +321,12 @@ class Changes:
 
     def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         sizes = np.diff(forest.node_base)
-        bits = [int(sizes[instance.tree]) for instance in instances]
-        # Each instance begins with a new word.
-        ends = np.cumsum([-(-count // 32) * 32 for count in bits])
-        self._base = np.concatenate([[0], ends[:-1]]).astype(np.int64)
-        self._drawn, self._before = (np.zeros(int(ends[-1]) // 32, np.uint32) for _ in range(2))
+        # A bit for each node; each instance begins with a new word.
+        words = np.cumsum([0, *(-(-int(sizes[instance.tree]) // 32) for instance in instances)])
+        self._base = (32 * words[:-1]).astype(np.int64)
+        self._drawn, self._before = (np.zeros(int(words[-1]), np.uint32) for _ in range(2))
         self._last: tuple[NDArray[np.uint32], NDArray[np.uint16]] | None = None
-        self._counts = [0] * len(bits)
+        self._counts = [0] * len(instances)
 
     def next(self, cut: TreeCut) -> list[tuple[int, int | None, int]]:
         """Return for each instance: nodes in this cut, nodes in both this and the last cut, and nodes in the last cut.
@@ -379,19 +346,18 @@ class Changes:
         return result
 
 
-#: The share of a cut that makes a picture almost what it will be; chosen.
+#: Share of a cut with which a picture is nearly complete; chosen.
 MOST = 0.9
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """State when a chunk has arrived.
+class Arrival(NamedTuple):
+    """State of a page when a chunk has arrived.
 
     Attributes:
         seconds: since the page was opened.
-        bytes: that have arrived so far, of headers too.
+        bytes: received so far, headers included.
         share: 0..1 of the splats of the whole cut that are resident.
-        resident: (chunks,) bool, of all trees.
+        resident: (chunks,) bool, of all scenes.
     """
 
     seconds: float
@@ -400,12 +366,14 @@ class Arrival:
     resident: NDArray[np.bool_]
 
 
-class Loader(StreamedCuts):
-    """Visitors who open a page with scenes, each in front of a camera, and wait; see `StreamedCuts`.
+class Loader(Simulation):
+    """Visitors who open a page with scenes, each in front of a camera at rest, and wait.
 
     Args:
         seconds: since they opened the page, for `cut`.
     """
+
+    remembers = False
 
     def __init__(
         self, scenes: Scenes, settings: LodSettings, streaming: StreamingSettings | None = None, seconds: float = 0.0
@@ -416,8 +384,8 @@ class Loader(StreamedCuts):
     def arrivals(self, camera: Camera) -> Iterator[Arrival]:
         """Yield the state at the beginning and after each arrival of a chunk, as long as any are wanted.
 
-        The camera rests. As soon as a chunk has arrived, the viewer finds the cut again, with the chunks that it has;
-        Spark does so with the next picture that it draws.
+        As soon as a chunk has arrived, the viewer finds the cut again, with the resident chunks; Spark does so with the
+        next picture that it draws.
         """
         per_chunk = self._splats_of(self.find(camera))
         total = max(1, int(per_chunk.sum()))
@@ -432,7 +400,7 @@ class Loader(StreamedCuts):
                     return
 
     def load(self, camera: Camera) -> Row:
-        """Return the waits, `LOADING`, of a visitor who stays at a camera; None if a cut never fits the cache."""
+        """Return the waits of a visitor, `LOADING`; those for a whole cut that never fits the cache are None."""
         figures: Row = dict.fromkeys(column.name for column in LOADING)
         for arrival in self.arrivals(camera):
             if figures["first_picture_s"] is None and self.chunks.shows(arrival.resident):
@@ -445,7 +413,7 @@ class Loader(StreamedCuts):
         return {column.name: column.rounded(figures[column.name]) for column in LOADING}
 
     def cut(self, camera: Camera) -> Cut:
-        """Return what a visitor sees after `seconds`."""
+        """Return the cut that a visitor sees after `seconds`."""
         resident = np.zeros(len(self.chunks.sizes), np.bool_)
         for arrival in self.arrivals(camera):
             if arrival.seconds > self.seconds:
@@ -454,7 +422,7 @@ class Loader(StreamedCuts):
         return self.scenes.cut_of(self.find(camera, resident))
 
     def _splats_of(self, cut: TreeCut) -> NDArray[np.int64]:
-        """Return the (chunks,) numbers of splats of a cut in each chunk of all trees."""
+        """Return (chunks,) int64, the splats of a cut in each chunk of all scenes."""
         counts = np.zeros(len(self.chunks.sizes), np.int64)
         scenes = [loaded for loaded in self.scenes.of_instance if loaded.kind is not None]
         for loaded, view, nodes in zip(scenes, cut.views, cut.indices(), strict=True):

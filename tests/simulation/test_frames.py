@@ -183,10 +183,10 @@ def test_budgets_and_caches_that_are_too_small_are_refused(three: Scenes) -> Non
         Simulation(many, LodSettings(10**6))
 
 
-def test_frames_have_the_share_of_splats_in_front(town: Scenes) -> None:
+def test_splats_behind_the_camera_are_counted(town: Scenes) -> None:
     at, away = camera((0, -1, -6)), camera((0, -1, -6), (0, -1, -20))
     first, second = Simulation(town, LodSettings(5_000)).run(path_of([at, away]))
-    assert (first.in_front, second.in_front) == (1.0, 0.0)
+    assert first.rows[0]["behind"] == 0
     assert (first.number, second.number) == (0, 1)
     assert second.rows[0]["behind"] == second.rows[0]["selected"] == len(second.cut)
 
