@@ -201,7 +201,7 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
             raise click.UsageError(f"--histogram: there is no quantity {name}; choose one of {', '.join(QUANTITIES)}")
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.reports import check_outputs, read_original
-        from ..inspection.blocks import CHUNK_COLUMNS
+        from ..inspection.report import CHUNK_COLUMNS
 
         console.announce_compiling()
         table = None
@@ -323,7 +323,7 @@ class _Job:
         return status
 
     def _print_chunks(self, name: str, report: Report) -> int:
-        from ..inspection.blocks import chunk_lines
+        from ..inspection.report import chunk_lines
 
         if report.chunks is None:
             self.console.error(f"{name}: its chunks are unknown, since it does not hold all of its splats")

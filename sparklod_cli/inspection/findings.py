@@ -1,10 +1,13 @@
-"""`Finding`, one fault of a file, the table of all kinds of findings, and counts of faulty splats."""
+"""Findings about files, the table of their kinds, and the blocks of splats that reports are computed from."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +15,13 @@ from numpy.typing import NDArray
 from ..codecs import streamed_manifest, tileset
 from ..codecs.format_rules import RuleViolation
 from ..codecs.rad import rad_header
+from ..codecs.rad.rad_reader import RadReader
+from ..io.files import reopened
+from ..model.lod_tree import CHUNK_NODES, LodTree
+from ..model.scene import Scene
+from ..model.splats import FloatArray, Splats
+from ..system.progress import Progress, silent
+from ..system.threads import ordered_map
 
 ERROR, WARNING, NOTE = "error", "warning", "note"
 
@@ -153,3 +163,83 @@ def merged(parts: Iterable[Mapping[str, MaskTally]]) -> Tallies:
         for name, tally in part.items():
             total[name] += tally
     return total
+
+
+def largest(rows: FloatArray) -> FloatArray:
+    """Return the (n,) maximum of each of (n, 3) rows, as `rows.max(axis=1)` does, but thirty times as fast."""
+    maximum: FloatArray = np.maximum(np.maximum(rows[:, 0], rows[:, 1]), rows[:, 2])
+    return maximum
+
+
+def smallest(rows: FloatArray) -> FloatArray:
+    """Return the (n,) minimum of each of (n, 3) rows."""
+    minimum: FloatArray = np.minimum(np.minimum(rows[:, 0], rows[:, 1]), rows[:, 2])
+    return minimum
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Consecutive splats from index `start` on, and their nodes, whose children are numbered as in the whole tree."""
+
+    start: int
+    splats: Splats
+    tree: LodTree | None
+
+    @property
+    def part(self) -> slice:
+        """Range of its indices among all splats."""
+        return slice(self.start, self.start + len(self.splats))
+
+
+@dataclass(frozen=True, eq=False)
+class ReportBlocks:
+    """A scene, block by block.
+
+    Attributes:
+        about: scene with the metadata of the file, and with the splats and the tree if they are in memory.
+        map: calls a function with each block, which has at least the given columns of `Splats`, and yields the results
+            in order. Blocks in memory are processed on the given number of threads.
+        in_memory: whether several threads may call `map`.
+    """
+
+    about: Scene
+    count: int
+    is_tree: bool
+    map: Callable[[Callable[[Block], Any], Collection[str], int], Iterator[Any]]
+    in_memory: bool = True
+
+    @classmethod
+    def of(cls, scene: Scene, unread: Collection[str] = ()) -> ReportBlocks:
+        """Divide a scene in memory into blocks of the chunk size of its file, or of `CHUNK_NODES`.
+
+        Columns in `unread` were not read; valid values replace them.
+        """
+        step, tree = scene.header.get("chunk_size") or CHUNK_NODES, scene.tree
+        blank = Splats.zeros(step if unread else 0, 0)
+        blank.quat_xyzw[:, 3] = 1
+
+        def at(start: int) -> Block:
+            part = slice(start, start + step)
+            splats = scene.splats.take(part)
+            replaced = {name: getattr(blank, name)[: len(splats)] for name in unread}
+            return Block(start, dataclasses.replace(splats, **replaced), None if tree is None else tree.rows(part))
+
+        def mapped(work: Callable[[Block], Any], columns: Collection[str], threads: int) -> Iterator[Any]:
+            return ordered_map(lambda start: work(at(start)), range(0, len(scene.splats), step), threads)
+
+        return cls(scene, len(scene.splats), tree is not None, mapped)
+
+    @classmethod
+    def of_file(cls, path: Path, rad: RadReader, *, threads: int = 1, progress: Progress = silent) -> ReportBlocks:
+        """Read a file chunk by chunk in each `map`. The first one unpacks all columns, to find damage."""
+        header, again = rad.header, False
+
+        def mapped(work: Callable[[Block], Any], columns: Collection[str], _: int) -> Iterator[Any]:
+            nonlocal again
+            thorough, again = not again, True
+            with reopened(path, rad) as reader:
+                for start, splats, tree in reader.chunks(columns, thorough=thorough, threads=threads):
+                    yield work(Block(start, splats, tree))
+                    progress("reading", start + len(splats), header.count, "splat")
+
+        return cls(rad.about(), header.count, header.lod_tree, mapped, in_memory=False)

@@ -1,4 +1,4 @@
-"""Reports as one self-contained page of HTML, made from their own keys, without scripts and without a network."""
+"""Reports as a self-contained page of HTML, laid out by their keys, without scripts and external resources."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from . import values
 from .findings import CODES, ERROR, NOTE, WARNING
 from .report import Report
 
-#: Content security policy: only the style and the pictures inside the page, whatever the name of a file contains.
+#: Content security policy: the page uses only its own style and pictures, whatever texts of files contain.
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 #: Severities, the worst first.
 SEVERITIES = (ERROR, WARNING, NOTE)
 
-#: Most findings of a file that are listed; checks have some forty kinds, but a file of expectations has no limit.
+#: Most findings of a file that are listed. Checks have some forty kinds, but expectations have no limit.
 MAX_FINDINGS = 200
 
-#: Titles of keys that say too little with blanks for their underscores.
+#: Titles of keys that would say too little by themselves; all other titles are the keys, with spaces.
 LABELS = {
     "first_bytes": "Size needed for a first picture",
     "bytes": "Size",
@@ -46,6 +46,11 @@ LABELS = {
     "zero_scale": "Splats of scale 0",
     "more_than_opaque": "Splats of opacity above 1",
 }
+
+#: Key figures of a report, from itself, its tree or its header, and their titles.
+FIGURES = {"splats": "Splats", "bytes": "Size", "leaves": "Leaves", "inner": "Inner nodes", "growth": "Growth"}
+FIGURES |= {"depth": "Depth", "chunks": "Chunks", "sh_degree": "SH degree", "antialiased": "Antialiased", "up": "Up"}
+FIGURES |= {"version": "Version", "fractional_bits": "Fractional bits"}
 
 #: Titles of the parts of a report, and titles and captions of the tables in them.
 PARTS = {"rad": "RAD", "streamed_sog": "Streamed SOG", "tiles": "3D Tiles", "tree": "Tree", "values": "Unusual values"}
@@ -63,28 +68,28 @@ TABLES = {
     ("values", "quantities"): ("Values", "Without numbers that are not finite."),
 }
 
-#: Width and height of a chart, and what the labels below and the figure above take of it, in units of its view box.
+#: Width and height of a chart, of which labels below and the figure above take parts, in units of its view box.
 WIDTH, HEIGHT, BELOW, ABOVE = 360, 150, 20, 16
 
 #: Number of labels below a histogram.
 LABELLED = 5
 
-#: Up to this number of children, every number has its own row; beyond it, ranges double.
+#: Numbers of children up to this one have a row each; beyond it, ranges double.
 SINGLE_CHILDREN = 8
 
-#: Stands for a missing value.
+#: Replaces a missing value.
 NONE = "\u2013"
 
 
 @dataclass(frozen=True)
 class FileSection:
-    """The part of a page about one file.
+    """Contents of the part of a page about one file.
 
     Attributes:
-        report: `Report.as_dict`; fields that are missing or None are left out.
-        picture: of the structure of the scene.
-        histograms: by the name of the quantity.
-        thumbnail: of the scene as a viewer draws it.
+        report: `Report.as_dict`, some fields of which may be missing.
+        picture: the structure of the scene.
+        histograms: those of its quantities, by name.
+        thumbnail: the scene as a viewer draws it.
     """
 
     report: Mapping[str, Any]
@@ -96,7 +101,7 @@ class FileSection:
 def section_of(
     report: Report, scene: Scene | None, picture: DescribedPicture | None, thumbnail: DescribedPicture | None = None
 ) -> FileSection:
-    """Return the section about a file: its report, its pictures, and histograms of the splats that were read."""
+    """Return the section about a file, with histograms if its splats were read."""
     drawn = {}
     if scene is not None and len(scene.splats):
         drawn = {name: values.histogram_of(scene.splats, name) for name in values.names_of(scene.splats)}
@@ -104,7 +109,7 @@ def section_of(
 
 
 def page(sections: Sequence[FileSection]) -> str:
-    """Return the page about one or more files, as HTML to be written in UTF-8."""
+    """Return the page about one or more files as HTML, for UTF-8."""
     one = len(sections) == 1
     title = f"{_text(sections[0].report.get('file', ''))} \u2013 sparklod inspect" if one else "sparklod inspect"
     contents = ""
@@ -169,16 +174,11 @@ def _figures(report: Mapping[str, Any]) -> str:
         "chunks": f"{_shown('', tree.get('chunks_of_coarse_cut'))} for a coarse cut",
         "up": "axis that points up",
     }
-    titles = {"splats": f"{noun.title()}s", "bytes": "Size"}
-    titles |= {key: key.title() for key in ("leaves", "inner", "growth", "depth", "chunks") if tree}
-    titles |= {"inner": "Inner nodes"} if tree else {}
-    titles |= {"sh_degree": "SH degree", "antialiased": "Antialiased", "up": "Up"}
-    titles |= {"version": "Version", "fractional_bits": "Fractional bits"}
-    items = []
-    for key, value in ((key, {**report, **tree, **header}.get(key)) for key in titles):
-        if value is not None or (tree and key in tree):
+    values, items = {**report, "chunks": None, **tree, **header}, []
+    for key, title in (FIGURES | {"splats": f"{noun.title()}s"}).items():
+        if values.get(key) is not None or key in tree:
             more = f"<small>{small[key]}</small>" if small.get(key) else ""
-            items.append(f"<div><dt>{titles[key]}</dt><dd>{_shown(key, value)}{more}</dd></div>")
+            items.append(f"<div><dt>{title}</dt><dd>{_shown(key, values[key])}{more}</dd></div>")
     return f'<dl class="figures">{"".join(items)}</dl>' if items else ""
 
 
@@ -200,7 +200,7 @@ def _findings(report: Mapping[str, Any]) -> str:
 
 
 def _part(name: str, part: Mapping[str, Any]) -> str:
-    """Return the panels of a part of a report: a table for each list or group in it, and one of the other values."""
+    """Return the panels of a part of a report: a table for each list or group in it, and one for its other values."""
     wide: list[str] = []
     panels: list[str] = []
     facts = []
@@ -226,7 +226,7 @@ def _part(name: str, part: Mapping[str, Any]) -> str:
             panels.append(_panel(title, _table(("", "x", "y", "z"), rows, "World units.")))
         elif isinstance(value, Mapping) and all(isinstance(each, Mapping) for each in value.values()):
             beside.append(_panel(title, _rows(value.items(), caption)))
-        elif name != "tree":  # whose values are among the key figures
+        elif name != "tree":  # its values are among the key figures
             facts.append([_label(key), _shown(key, value)])
     if facts:
         panels.append(_panel(PARTS[name], _table(("", ""), facts, "")))
@@ -234,7 +234,7 @@ def _part(name: str, part: Mapping[str, Any]) -> str:
 
 
 def _rows(rows: Iterable[tuple[str, Mapping[str, Any]]], caption: str) -> str:
-    """Return a table with a column for each key, and bars of shares or counts."""
+    """Return a table of named rows with a column for each key, and bars of shares or counts."""
     rows = list(rows)
     counted = "nodes" if "nodes" in rows[0][1] else "splats"
     most = max(row.get(counted, 0) for _, row in rows) or 1
@@ -266,7 +266,7 @@ def _label(key: str) -> str:
 
 
 def _shown(key: str, value: Any) -> str:
-    """Return a value of a report as HTML; sizes and shares are recognised by their keys."""
+    """Return a value of a report as HTML; its key tells sizes and shares."""
     if value is None:
         return NONE
     if isinstance(value, Mapping):
@@ -311,7 +311,7 @@ def _cell(content: str) -> str:
 
 
 def _bar(*shares: float) -> str:
-    """Return bars of shares, 0..1, side by side, for a cell of a table whose other cells have the numbers."""
+    """Return bars of shares, 0..1, side by side, for a cell of a table with the numbers in other cells."""
     parts = "".join(
         f'<i class="of{n}" style="width:{100 * share:.2f}%"></i>' for n, share in enumerate(shares) if share
     )
@@ -332,15 +332,14 @@ def _histograms(histograms: Mapping[str, Histogram]) -> str:
     for name, counted in histograms.items():
         beyond = ((counted.below, "below"), (counted.above, "above"), (counted.not_finite, "not finite"))
         remarks = ["bins of equal ratios"] * counted.log + [f"{count:,} {where}" for count, where in beyond if count]
-        meaning = values.QUANTITIES[name].meaning if name in values.QUANTITIES else ""
-        said = "; ".join(filter(None, [meaning, *remarks]))
+        said = "; ".join([values.QUANTITIES[name].meaning, *remarks])
         head = f'<h4>{_text(name)}</h4><p class="faint">{_text(said)}</p>'
         parts.append(f"<div>{head}{_chart(counted, name) or '<p>no numbers</p>'}</div>")
     return _panel("Histograms", f'<div class="charts">{"".join(parts)}</div>' if parts else "")
 
 
 def _chart(histogram: Histogram, name: str) -> str:
-    """Return a histogram as a bar chart; an empty text if it has no numbers."""
+    """Return a histogram as a bar chart; empty without numbers."""
     counts = [int(count) for count in histogram.counts]
     if not counts:
         return ""
@@ -371,14 +370,14 @@ def _chart(histogram: Histogram, name: str) -> str:
 
 
 def children_groups(children: Mapping[str, int]) -> list[tuple[str, int]]:
-    """Return numbers of nodes by their number of children: first single numbers, then ranges that double."""
-    most = max(map(int, children), default=0)
-    ranges = [(number, number) for number in range(1, min(SINGLE_CHILDREN, most) + 1)]
-    while ranges and ranges[-1][1] < most:
-        ranges.append((ranges[-1][1] + 1, 2 * ranges[-1][1]))
-    ends = [high for _, high in ranges]
-    counts = [0] * len(ranges)
+    """Count nodes by their number of children: single numbers first, then ranges that double."""
+    most = max(map(int, children))
+    ends = [*range(1, min(SINGLE_CHILDREN, most) + 1)]
+    while ends[-1] < most:
+        ends.append(2 * ends[-1])
+    counts = dict.fromkeys(ends, 0)
     for number, count in children.items():
-        counts[bisect_left(ends, int(number))] += count
-    names = [f"{low}" if low == high else f"{low:,} to {high:,}" for low, high in ranges]
-    return list(zip(names, counts, strict=True))
+        counts[ends[bisect_left(ends, int(number))]] += count
+    return [
+        (f"{end}" if end <= SINGLE_CHILDREN else f"{end // 2 + 1:,} to {end:,}", count) for end, count in counts.items()
+    ]

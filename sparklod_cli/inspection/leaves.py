@@ -1,4 +1,4 @@
-"""Checks that the leaves of a tree are the splats of the file that it was baked from."""
+"""Check that the leaves of a tree are the splats of the file that it was baked from."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from ..system.units import count_of
 from .findings import Finding
 from .headers import PropertyFacts, RadFacts
 
-#: Largest differences of the codes of one splat: writers round, truncate or go through float16. SPZ's codes of SH keep
-#: upper bits only, so that a step of theirs is a bucket of 16; logarithms of scales as float32 differ in last bits.
+#: Largest differences between codes of one splat, as writers round, truncate or go through float16. SPZ's codes of SH
+#: keep the upper bits only, so that one step is a bucket of 16; logarithms of scales as float32 differ in last bits.
 STEPS, SH_STEPS, F32_STEPS = 1, 16, 64
 
-#: Largest angle in degrees between two codes of one rotation: by the bytes of an SPZ code, and by RAD's encoding.
+#: Largest angle in degrees between two codes of one rotation, by the bytes of an SPZ code and by RAD's encoding. RAD's
+#: f16 and f32 omit w, which is less exact near 0.
 DEGREES = {3: 14.0, 4: 0.8}
-#: As f16 and f32 it has no w, which is the less exact the nearer it is to 0.
 RAD_DEGREES = {"oct88r8": 4.0, "f16": 4.0, "f32": 0.2}
 
-#: The columns of SPZ whose codes may differ by a step, in the order in which `CodedSplats.numbers` has them.
+#: Columns of SPZ whose codes may differ by a step, in the order of `CodedSplats.numbers`.
 COLUMNS = ("center", "opacity", "rgb", "scale", "sh")
 
-#: Most bits after the binary point of centres that were rounded: those of SPZ.
+#: Most bits after the binary point of rounded centres, as in SPZ.
 MOST_BITS = 24
 
-#: Encodings of RAD that only order the bytes of another one in a way that compresses better.
+#: Encodings of RAD that are others with their bytes reordered, which compresses better.
 PLAIN = {"f32_lebytes": "f32", "f16_lebytes": "f16", "r8_delta": "r8", "s8_delta": "s8"}
 
 
@@ -49,8 +49,8 @@ class CodedSplats:
     """N splats as codes.
 
     Attributes:
-        rows: (N,) all bytes of a splat as one value, to compare whole splats.
-        numbers: (N, n) codes; the first three are those of the centre.
+        rows: (N,) all bytes of each splat as one value.
+        numbers: (N, n) codes; the first three are of the centre.
         quat_xyzw: (N, 4).
     """
 
@@ -61,11 +61,11 @@ class CodedSplats:
 
 @dataclass(frozen=True)
 class LeafCoding:
-    """Coding of splats as integers, to compare the splats of a file, and its tolerances.
+    """Coding of splats as integers, in which the splats of two files are compared.
 
     Attributes:
-        steps: (n,) largest differences of `CodedSplats.numbers` between two codes of one splat.
-        degrees: largest angle between two codes of one rotation.
+        steps: (n,) largest differences of `CodedSplats.numbers` for the same splat.
+        degrees: largest angle between the rotations of the same splat.
     """
 
     encode: Callable[[Splats], CodedSplats]
@@ -74,21 +74,21 @@ class LeafCoding:
 
 
 def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts | None) -> Iterator[LeafCoding | str]:
-    """Yield the possible codings of leaves that were `original`, the most likely first, or why none is known."""
+    """Yield codings in which the leaves could be equal to `original`, the most likely first, or why there is none."""
     if facts is None:
         yield from (of_spz(scene, leaves, covering=covering) for covering in (True, False))
         return
-    # RAD does not store to how many bits centres were rounded. By default the scales decide; else the leaves tell.
+    # RAD does not store the number of bits to which centres were rounded: by default it follows from the scales.
     scales, bits = Distribution.of(np.maximum.reduce(original.scale.T)), _fractional_bits(leaves.center)
     for guess, covering in ((fine_bits(scales), True), (bits, True), (bits, False)):
         yield of_rad(facts, leaves, guess, covering=covering)
 
 
 def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> LeafCoding:
-    """Return the coding of an SPZ file that a scene was read from.
+    """Return the coding of the SPZ file of a scene.
 
     Args:
-        covering: opacities make up for the rounding of scales, see `quantize.compensated`; only sparklod writes so.
+        covering: opacities compensate the rounding of scales, see `quantize.compensated`, as only sparklod does.
     """
     version, bits = max(2, int(scene.header["version"])), int(scene.header["fractional_bits"])
     degree = scene.splats.sh_degree
@@ -101,7 +101,7 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> LeafCoding:
         splats = to_code(splats, None, bits, sh_bits, covering=covering)
         for stream in Layout(version, len(splats), degree, bits, LOD).streams():
             if not hasattr(splats, stream.column):
-                continue  # the columns of the tree
+                continue  # a column of the tree
             values = np.ascontiguousarray(stream.encode(getattr(splats, stream.column)))
             codes = values.view(np.uint8).reshape(len(splats), stream.size)
             parts.append(codes)
@@ -115,20 +115,17 @@ def of_spz(scene: Scene, leaves: Splats, *, covering: bool) -> LeafCoding:
 
 
 def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering: bool) -> LeafCoding | str:
-    """Return the coding of a RAD file, without a palette of SH, or the reason why its leaves cannot be compared.
+    """Return the coding of a RAD file, ignoring a palette of SH, or the reason why its leaves cannot be compared.
 
     Args:
-        rounded_to: bits after the binary point to which its writer rounded centres; None if it did not.
+        rounded_to: bits after the binary point to which the writer rounded centres; None for no rounding.
     """
     mixed = [name for name, found in facts.properties.items() if "," in found.encoding]
     if mixed:
         return f"its chunks have {mixed[0]} in several encodings, in which leaves cannot be compared"
-    compared = [
-        (row, facts.properties[row.name], PLAIN.get(facts.properties[row.name].encoding))
-        for row in PROPERTIES
-        if row.name in facts.properties and row.option and not row.codes and row.name != "orientation"
-    ]
-    properties = [(row, found, plain or found.encoding) for row, found, plain in compared]
+    rows = [row for row in PROPERTIES if row.name in facts.properties and row.option and not row.codes]
+    stored = [(row, facts.properties[row.name]) for row in rows if row.name != "orientation"]
+    properties = [(row, found, PLAIN.get(found.encoding, found.encoding)) for row, found in stored]
     bits = _fractional_bits(leaves.center)
     steps = [np.full(row.numbers, F32_STEPS if name == "f32" else STEPS) for row, _, name in properties]
     if bits is not None and properties[0][0].name == "center":
@@ -155,7 +152,7 @@ def of_rad(facts: RadFacts, leaves: Splats, rounded_to: int | None, *, covering:
 
 
 def _fractional_bits(center: FloatArray) -> int | None:
-    """Bits after the binary point of all coordinates; None if they are not rounded, or have too many."""
+    """Return the fewest bits after the binary point that hold all coordinates; None if these are too many."""
     most = float(np.abs(center).max(initial=0))
     for bits in range(MOST_BITS + 1):
         scaled = center * np.float32(2.0**bits)
@@ -167,7 +164,7 @@ def _fractional_bits(center: FloatArray) -> int | None:
 
 
 def _covering(splats: Splats, facts: RadFacts, bits: int | None) -> Splats:
-    """Splats whose opacities make up for the rounding of their scales in a RAD file."""
+    """Return splats whose opacities compensate the rounding of their scales in a RAD file."""
     found = facts.properties.get("scales")
     if found is None:
         return splats
@@ -177,7 +174,7 @@ def _covering(splats: Splats, facts: RadFacts, bits: int | None) -> Splats:
 
 
 def _rad_codes(splats: Splats, row: Row, found: PropertyFacts, encoding: str) -> NDArray[np.int32]:
-    """(N, numbers) codes of a property, in the order of their values."""
+    """Return the (N, numbers) codes of a property, which are ordered as their values."""
     values = getattr(splats, row.column)
     if row.column == "sh":
         values = values[:, COEFFICIENTS[row.degree - 1] : COEFFICIENTS[row.degree]]
@@ -188,7 +185,7 @@ def _rad_codes(splats: Splats, row: Row, found: PropertyFacts, encoding: str) ->
         return (codes.astype(np.uint8).view(np.int8) if encoding == "s8" else codes).astype(np.int32)
     bits = np.ascontiguousarray(codes).view(f"<i{codes.dtype.itemsize}").astype(np.int64)
     lowest = -(1 << (8 * codes.dtype.itemsize - 1))
-    # Magnitudes with a sign, to numbers that grow with the value.
+    # Bits of floats are a sign and a magnitude; integers in their place must grow with the value.
     return np.where(bits < 0, lowest - bits, bits).astype(np.int32)
 
 
@@ -197,19 +194,19 @@ def _rows(parts: list[NDArray[np.uint8]]) -> NDArray[np.void]:
     return together.view(np.dtype((np.void, together.shape[1])))[:, 0]
 
 
-#: Most leaves, without an equal splat or one at the same place of the order, that are searched for nearby: searching
-#: takes time that grows with their number.
+#: Most leaves for which a search looks among nearby splats: those with neither an equal splat nor a similar one at the
+#: same place of the order.
 MAX_SEARCHED = 20_000
 
 
 def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[Finding]:
-    """Return a finding if the leaves of `scene`, a tree, are not exactly the splats of `original` that can be drawn.
+    """Return a finding if the leaves of `scene`, a tree, are not exactly the visible splats of `original`.
 
-    Both are compared as codes of the tree's file: most are equal, and each of the rest must pair with one whose codes
-    all lie within a step.
+    Both are compared in the codes of the tree's file: most are equal, and the rest must pair up so that all codes of a
+    pair lie within a step of each other.
 
     Args:
-        facts: of the RAD file that the tree is from; None for SPZ.
+        facts: those of the RAD file of the tree; None for SPZ.
     """
     if scene.tree is None:
         return [Finding("expect.leaves", "the file has no tree whose leaves could be compared")]
@@ -239,16 +236,16 @@ def check(scene: Scene, original: Scene, facts: RadFacts | None = None) -> list[
 
 
 def _unpaired(ours: CodedSplats, theirs: CodedSplats, coding: LeafCoding) -> NDArray[np.intp]:
-    """Ascending indices of ours without a counterpart among theirs; each of theirs pairs with only one of ours."""
+    """Return ascending indices of our splats that pair with none of theirs; a splat is in one pair at most."""
     left, right = _not_equal(ours.rows, theirs.rows)
-    # Splats of a writer that rounds differently mostly still have the same order when sorted.
+    # When sorted, splats mostly have the same order even if the writers round differently.
     left = left[np.lexsort(ours.numbers[left].T[::-1])]
     right = right[np.lexsort(theirs.numbers[right].T[::-1])]
     apart = ~_alike(ours, left, theirs, right, coding)
     left, right = np.sort(left[apart]), right[apart]
     if len(left) > MAX_SEARCHED:
         return left
-    # The others are searched for along the axis with the most distinct coordinates.
+    # Search for the rest along the axis with the most distinct coordinates.
     axis = int(np.argmax([len(np.unique(theirs.numbers[right, axis])) for axis in range(3)]))
     free = right[np.argsort(theirs.numbers[right, axis], kind="stable")]
     along, step = theirs.numbers[free, axis], coding.steps[axis]
@@ -269,7 +266,7 @@ def _unpaired(ours: CodedSplats, theirs: CodedSplats, coding: LeafCoding) -> NDA
 def _alike(
     ours: CodedSplats, left: NDArray[np.intp], theirs: CodedSplats, right: NDArray[np.intp], coding: LeafCoding
 ) -> NDArray[np.bool_]:
-    """Whether pairs of splats of ours and theirs lie within a step of each other in every code."""
+    """Return, for each pair of splats, whether all of their codes lie within a step of each other."""
     near = (_apart(theirs.numbers[right], ours.numbers[left]) <= coding.steps).all(axis=1)
     cosine = np.abs(np.einsum("ij,ij->i", theirs.quat_xyzw[right], ours.quat_xyzw[left], dtype=np.float64))
     return near & (np.degrees(2 * np.arccos(np.minimum(cosine, 1))) <= coding.degrees)
@@ -280,10 +277,10 @@ def _apart(one: NDArray[np.int32], other: NDArray[np.int32]) -> NDArray[np.int64
 
 
 def _not_equal(ours: NDArray[np.void], theirs: NDArray[np.void]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Ascending indices of ours and of theirs that remain when pairs of equal rows are removed."""
+    """Return ascending indices of our and their rows that remain when pairs of equal rows are removed."""
     count = len(ours)
     rows = np.concatenate([ours, theirs])
-    order = np.argsort(rows, kind="stable")  # of equal rows ours come first
+    order = np.argsort(rows, kind="stable")  # ours come first among equal rows
     ordered, is_ours = rows[order], order < count
     begins = np.concatenate([[True], ordered[1:] != ordered[:-1]])
     group = np.cumsum(begins) - 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -20,18 +20,105 @@ from ..codecs.spark_codings import SplatEncoding
 from ..codecs.spz import KNOWN_FLAGS
 from ..io.files import opened, read_arrays, read_text, size_of_input
 from ..io.reading import read_scene
+from ..lod.kernels.tree_links import find_depths, find_parents
+from ..model.gaussian import spark_size
+from ..model.lod_tree import LodTree
 from ..model.scene import Scene
 from ..model.sh import width_of
-from ..model.splats import COLUMNS, Splats
+from ..model.splats import COLUMNS, FloatArray, Splats
 from ..system.errors import FormatError, SparklodError
 from ..system.progress import Progress, silent
 from ..system.untrusted import QUOTED, near, printable, quoted
 from ..tables.assertions import Assertion, BadAssertionError, is_number, number_text, parse_assertion
-from ..tables.columns import Row
+from ..tables.columns import Cell, Column, Row
 from . import headers, tree, values
-from .blocks import Block, ReportBlocks, chunk_row, chunk_table
-from .findings import Finding, findings_of, merged
+from .findings import Block, Finding, ReportBlocks, findings_of, merged
 from .headers import HeaderScan
+
+CHUNK_COLUMNS = (
+    Column("chunk", int, "", "", "number of the chunk, from 0"),
+    Column("base", int, "", "", "index of its first splat"),
+    Column("splats", int, "", "splats", "splats; nodes in a tree"),
+    Column("leaves", int, "", "splats", "leaves among them; empty without a tree"),
+    Column("bytes", int, "", "bytes", "size in the file; empty in formats without chunks"),
+    *(
+        Column(f"{end}_{axis}", float, ".6g", "world units", f"{what} {axis} of the centres")
+        for end, what in (("min", "lowest"), ("max", "highest"))
+        for axis in "xyz"
+    ),
+    Column("extent", float, ".6g", "world units", "diagonal of the box of the centres"),
+    Column("size_min", float, ".6g", "world units", "smallest feature size"),
+    Column("size_max", float, ".6g", "world units", "largest feature size"),
+    Column("depth_min", int, "", "", "smallest depth of a node; empty without a tree"),
+    Column("depth_max", int, "", "", "largest depth of a node; empty without a tree"),
+    Column("parent_chunks", int, "", "", "other chunks that hold parents of its nodes; empty without a tree"),
+)
+
+#: Columns of the printed table, with their headings and widths, 80 characters in all.
+SHOWN_COLUMNS = {
+    "chunk": ("chunk", 6),
+    "splats": ("splats", 8),
+    "leaves": ("leaves", 8),
+    "bytes": ("bytes", 11),
+    "extent": ("extent", 9),
+    "size_min": ("size", 10),
+    "size_max": ("to", 10),
+    "depth_min": ("depth", 6),
+    "depth_max": ("to", 4),
+    "parent_chunks": ("parents", 8),
+}
+
+
+def chunk_row(block: Block) -> dict[str, Any]:
+    """Return the row of a block with center, scale and opacity, for `chunk_table` to complete."""
+    center, size = block.splats.center, spark_size(block.splats)
+    low, high = center.min(axis=0), center.max(axis=0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        extent = np.linalg.norm(high.astype(np.float64) - low)
+    numbers = dict(zip(("min_x", "min_y", "min_z", "max_x", "max_y", "max_z"), (*low, *high), strict=True))
+    numbers |= {"extent": extent, "size_min": size.min(), "size_max": size.max()}
+    row: dict[str, Any] = dict.fromkeys(column.name for column in CHUNK_COLUMNS)
+    row |= {"base": block.start, "splats": len(center)}
+    row["leaves"] = None if block.tree is None else int(np.count_nonzero(block.tree.is_leaf))
+    return row | {name: float(value) for name, value in numbers.items() if np.isfinite(value)}
+
+
+def chunk_table(
+    rows: Sequence[dict[str, Any]], chunk_bytes: Sequence[int] | None, nodes: tuple[LodTree, FloatArray] | None
+) -> list[Row]:
+    """Complete the rows of all chunks, see `chunk_row`.
+
+    Args:
+        chunk_bytes: sizes in the file; None for formats without chunks.
+        nodes: the tree and its (N,) feature sizes.
+    """
+    if nodes is not None:
+        tree, size = nodes
+        depth, _ = find_depths(tree.child_count, tree.child_start, size)
+        parent, _ = find_parents(tree.child_count, tree.child_start)
+    for chunk, row in enumerate(rows):
+        row["chunk"], row["bytes"] = chunk, None if chunk_bytes is None else chunk_bytes[chunk]
+        if nodes is not None:
+            part = slice(row["base"], row["base"] + row["splats"])
+            chunks = np.unique(parent[part][parent[part] >= 0] // rows[0]["splats"])
+            row["parent_chunks"] = int(np.count_nonzero(chunks != chunk))
+            row["depth_min"], row["depth_max"] = (int(max(end, 0)) for end in (depth[part].min(), depth[part].max()))
+    return [{column.name: column.rounded(row[column.name]) for column in CHUNK_COLUMNS} for row in rows]
+
+
+def chunk_lines(rows: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield the lines of the printed table, without empty columns."""
+    shown = {name: column for name, column in SHOWN_COLUMNS.items() if any(row[name] is not None for row in rows)}
+    yield "".join(f"{heading:>{width}}" for heading, width in shown.values())
+    for row in rows:
+        yield "".join(f"{_text(row[name]):>{width}}" for name, (_, width) in shown.items())
+
+
+def _text(value: Cell) -> str:
+    if value is None:
+        return ""
+    return f"{value:,}" if isinstance(value, int) else f"{value:.4g}" if isinstance(value, float) else value
+
 
 #: Version of the report: counts up when a field changes its meaning or is removed. schema.json describes this one.
 SCHEMA_VERSION = 1

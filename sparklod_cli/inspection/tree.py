@@ -26,8 +26,7 @@ from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES, LodTree
 from ..model.splats import FloatArray
 from ..system.threads import blocks_of, ordered_map
-from .blocks import Block, ReportBlocks, largest
-from .findings import Finding, Mask, MaskTally, Tallies, merged, tallies
+from .findings import Block, Finding, Mask, MaskTally, ReportBlocks, Tallies, largest, merged, tallies
 
 #: Smallest feature size of a node over the mean of its children's, weighted by area. A merged splat has at least their
 #: variance, so nodes of a good tree reach 0.5; a much smaller one is drawn in their place for too long. A single faint

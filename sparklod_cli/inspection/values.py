@@ -19,8 +19,7 @@ from ..model.sh import COEFFICIENTS
 from ..model.splats import FloatArray, Splats
 from ..system.threads import ordered_map
 from ..tables.histograms import Histogram, histogram
-from .blocks import Block, ReportBlocks, largest, smallest
-from .findings import Finding, Mask, Tallies, merged, tallies
+from .findings import Block, Finding, Mask, ReportBlocks, Tallies, largest, merged, smallest, tallies
 
 #: Coordinates, whose percentiles are those of the box.
 AXES = ("x", "y", "z")

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sparklod_cli.inspection.blocks import ReportBlocks
-from sparklod_cli.inspection.findings import Finding
+from sparklod_cli.inspection.findings import Finding, ReportBlocks
 from sparklod_cli.inspection.report import Report, ReportSettings, report_on
 from sparklod_cli.inspection.tree import TreeFacts
 from sparklod_cli.model.lod_tree import LodTree

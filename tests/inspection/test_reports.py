@@ -17,9 +17,8 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.formats import ENCODINGS
 from sparklod_cli.codecs.rad import rad_writer as codec
-from sparklod_cli.inspection import blocks as blocks_of
 from sparklod_cli.inspection import headers
-from sparklod_cli.inspection.report import Report, ReportSettings, inspect
+from sparklod_cli.inspection.report import CHUNK_COLUMNS, Report, ReportSettings, inspect
 from sparklod_cli.io.reading import read_parts, read_scene
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.scene import Scene
@@ -379,7 +378,7 @@ def test_the_table_is_printed_and_written(tmp_path: Path, capsys: Capture) -> No
     assert (first[:2], second[:2]) == (["0", "65,536"], ["1", "8"])
     with output.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [column.name for column in blocks_of.CHUNK_COLUMNS] == list(rows[0])
+    assert [column.name for column in CHUNK_COLUMNS] == list(rows[0])
     assert [row["splats"] for row in rows] == ["65536", "8"]
     assert run(["inspect", str(path), "--chunks", "--json"]) == 0
     plain = json.loads(capsys.readouterr().out)

@@ -18,9 +18,8 @@ from sparklod_cli.cli import run
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.formats import FORMATS, WriteOptions
 from sparklod_cli.inspection import values
-from sparklod_cli.inspection.blocks import CHUNK_COLUMNS
 from sparklod_cli.inspection.findings import CODES
-from sparklod_cli.inspection.report import SCHEMA_VERSION, ReportSettings, inspect, value_at
+from sparklod_cli.inspection.report import CHUNK_COLUMNS, SCHEMA_VERSION, ReportSettings, inspect, value_at
 from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import MAX_CHILDREN, LodTree
 from sparklod_cli.model.scene import Scene

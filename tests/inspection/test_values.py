@@ -362,7 +362,7 @@ def random_file(version: int, *, flags: int, count: int = 300, links: int = 0) -
 @pytest.mark.parametrize("flags", [0, ANTIALIASED, LOD])
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_columns_of_any_codes(version: int, flags: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparklod_cli.inspection.blocks.CHUNK_NODES", 64)
+    monkeypatch.setattr("sparklod_cli.inspection.findings.CHUNK_NODES", 64)
     path = tmp_path / "any.spz"
     path.write_bytes(random_file(version, flags=flags, links=5))
     check_columns(path)
