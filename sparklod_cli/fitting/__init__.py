@@ -1,12 +1,12 @@
 """Fits the merged splats of a finished tree to pictures of full detail: begin with `fit.fit`.
 
-`settings` says what can be chosen and what is reported. Imports nothing heavy: `--help` reads the constants below.
+`fit_settings` has the settings and the report. Imports nothing heavy: `--help` reads the constants below.
 """
 
 from ..render import DEVICE_HELP
 from ..system.setting_fields import whole
 
-#: Numbers of steps, up to far more than pay, and hours of work; and seeds.
+#: Ranges of numbers of steps, the largest far beyond use and hours of work, and of seeds.
 STEPS, SEED = whole(1, 1_000_000), whole(0, (1 << 32) - 1)
 
 #: Help of the options of fitting.

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
@@ -41,15 +41,15 @@ from .pictures import (
 #: Stages, after each of which held-out cameras decide.
 STAGES = 12
 
-#: Rates of the first steps, and those of the last ones over these. Measured (benchmarks/notes/refining.md).
+#: Rates of the first steps, and their ratio to those of the last steps. Measured (benchmarks/notes/refining.md).
 RATES, LAST = Rates(0.006, 0.012, 0.003, 0.006, 0.006, 0.0012), 0.02
 
-#: Steps unless given: the most, the least, and their number times that of the leaves. Chosen.
+#: Default number of steps: the most, the least, and its product with the number of leaves. Chosen.
 MOST_BY_DEFAULT, LEAST_BY_DEFAULT, WORK = 12_000, 1000, 3_000_000_000
 
 
 class Schedule:
-    """Steps that remain, and their rates: half a wave of a cosine, from `RATES` to `LAST` of them."""
+    """Number of remaining steps, and their rates: half a cosine wave, from `RATES` down to `LAST` times `RATES`."""
 
     def __init__(self, steps: int) -> None:
         self.done, self.remaining = 0, steps
@@ -58,19 +58,22 @@ class Schedule:
 
     @property
     def stage_steps(self) -> int:
+        """Number of steps of the next stage."""
         return min(self._stage, self.remaining)
 
     def rates(self) -> Rates:
+        """Return the rates of the next step."""
         factor = LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * self._progress))
         return Rates(*(rate * factor for rate in RATES))
 
     def advance(self) -> None:
+        """Count a step as done."""
         self._progress += (1 - self._progress) / self.remaining
         self.done += 1
         self.remaining -= 1
 
     def shorten(self) -> None:
-        """Leave out half of the steps that remain, and all if less than a stage remains."""
+        """Drop half of the remaining steps, or all if at most a stage remains."""
         self.remaining = self.remaining // 2 if self.remaining > self._stage else 0
 
 
@@ -82,17 +85,17 @@ def default_steps(leaves: int) -> int:
 #: Near plane at most and far plane at least, in radii of the scene, for scenes of tiny or huge units.
 NEAR, FAR = 0.01, 100.0
 
-#: Shares of the leaves that cuts are drawn of, and the golden ratio, whose multiples spread evenly.
+#: Range of the sizes of drawn cuts, as shares of the leaves, and the golden ratio, whose multiples spread evenly.
 LEAST_SHARE, MOST_SHARE, GOLDEN = 0.01, 0.7, 0.6180339887498949
 
-#: Steps whose cuts are found while as many steps before them are taken. Measured (benchmarks/notes/cuts-ahead.md).
+#: Steps whose cuts are found during the same number of steps before. Measured (benchmarks/notes/cuts-ahead.md).
 AHEAD = 8
 
-#: Least mean gain of a stage of the second half, dB a step; after a smaller one, half of the steps that remain are left
-#: out. Large steps may lose at first and pay later. Chosen.
+#: Least mean gain of a stage of the second half, dB a step; after a smaller gain, half of the remaining steps are
+#: dropped. The large steps of the first half may lose at first and pay later. Chosen.
 FLAT = 3e-5
 
-#: Times that nodes are given their first values for one law after another, until they keep all.
+#: Attempts at restoring nodes for one law after another, until all laws hold.
 TRIES = 4
 
 
@@ -112,27 +115,27 @@ def fit(
 
     Args:
         nodes: N nodes in final order.
-        tree: of them; it stays as it is, and so do the leaves, bit for bit, unless `fixed` has them.
-        fixed: indices of one cut, ascending, whose nodes alone are fitted, leaves too, for all cameras; no node has an
-            opacity above 1, and none gets one. None for the cuts that Spark draws.
-        antialiased: of the scene; splats are drawn the same either way, as Spark draws them.
-        say: called with a line of text after each stage.
-        interrupted: called between steps; when it returns True, the gain of the finished stages is returned.
+        tree: of the nodes. It does not change, nor do the leaves, bit for bit, unless `fixed` has some.
+        fixed: indices of one cut, ascending, drawn for all cameras: only its nodes are fitted, leaves too. Their
+            opacities are at most 1, and stay so. None for the cuts that Spark draws.
+        antialiased: of the scene; has no effect, as Spark draws splats the same either way.
+        say: receives a line of text after each stage.
+        interrupted: called between steps; True ends the fit with the gains of the finished stages.
 
     Raises:
         BackendError: `settings.device` is "cuda", and there is no card, or it failed, or its memory does not suffice.
 
     Returns:
-        N nodes, and the report; at none of `settings.SHARES` are held-out cameras farther from full detail than before.
+        N nodes, and the report. At each of `fit_settings.SHARES`, the mean PSNR of the held-out cameras is at least
+        that before.
     """
 
     def run(device: str) -> tuple[Splats, Refined]:
         fitting = _Fitting(nodes, tree, dataclasses.replace(settings, device=device), fixed, threads, say)
-        while fitting.schedule.remaining:
-            if not fitting.run_stage(progress, interrupted):
-                return fitting.finish(is_complete=False)
-            say(fitting.describe_stage())
-        return fitting.finish(is_complete=True)
+        is_complete = True
+        while is_complete and fitting.schedule.remaining:
+            is_complete = fitting.run_stage(progress, interrupted)
+        return fitting.finish(is_complete)
 
     with on_threads(threads):
         try:
@@ -141,12 +144,12 @@ def fit(
             if settings.device != "auto":
                 raise
             say(f"starts again on the processor: {error}")
-        # Not from where the card stopped: the result is that of the processor.
+        # From the beginning, so that the result is that of the processor.
         return run("cpu")
 
 
 def raster_for(place: Place) -> RasterSettings:
-    """Return the settings that the pictures of a scene are drawn with."""
+    """Return the raster settings for pictures of a scene."""
     raster = RasterSettings()
     return RasterSettings(near=min(raster.near, NEAR * place.radius), far=max(raster.far, FAR * place.radius))
 
@@ -163,7 +166,7 @@ class _Fitting:
         threads: int,
         say: Callable[[str], None],
     ) -> None:
-        self._threads, self._seed = threads, settings.seed
+        self._threads, self._seed, self._say = threads, settings.seed, say
         place = Place.of(nodes.center[tree.is_leaf])
         raster = raster_for(place)
         self.nodes = (
@@ -187,7 +190,7 @@ class _Fitting:
         self._stages: list[FitStage] = []
 
     def _drawn(self, random: np.random.Generator) -> Iterator[tuple[FullDetailPicture, float]]:
-        """Yield pictures, each as often as the others, and shares of the leaves, evenly spread over their range."""
+        """Yield all pictures equally often, in random order, with shares of the leaves spread over their range."""
         spread = random.random()
         while True:
             for at in random.permutation(len(self._training)):
@@ -195,7 +198,7 @@ class _Fitting:
                 yield self._training[at], LEAST_SHARE * (MOST_SHARE / LEAST_SHARE) ** spread
 
     def run_stage(self, progress: Progress, interrupted: Callable[[], bool]) -> bool:
-        """Take the steps of a stage, and keep the nodes if they gained; return False if it was interrupted."""
+        """Take the steps of a stage, and keep the nodes if they gained; return False if interrupted."""
         schedule = self.schedule
         steps = schedule.stage_steps
         for picture, cut in self._with_cuts(itertools.islice(self._examples, steps)):
@@ -212,41 +215,35 @@ class _Fitting:
             schedule.shorten()
         if gain(self._best, now) > 0:
             self._best, self._kept = now, self.nodes.copy()
+        changes = (f"{percent_of(share)} {self._before[share]:.2f} -> {now[share]:.2f} dB" for share in now)
+        self._say(f"{self._stages[-1].name}: {', '.join(changes)}")
         return True
 
     def _with_cuts(
         self, examples: Iterator[tuple[FullDetailPicture, float]]
     ) -> Iterator[tuple[FullDetailPicture, Index]]:
-        """Yield pictures and cuts, which threads find ahead; the nodes are placed when the last step is taken.
+        """Yield pictures and their cuts, found in advance by threads; place the nodes after the last step.
 
-        Cuts of AHEAD steps are found while the AHEAD steps before them are taken, from the nodes as they were before
-        these; those of the first steps of a stage from the nodes at its start. So they depend on neither the time that
-        they take nor the number of threads.
+        The cuts of AHEAD steps are found during the AHEAD steps before, from the nodes as they were before those; the
+        cuts of the first steps of a stage from the nodes at its start. So they depend on neither timing nor the number
+        of threads.
         """
         with ThreadPoolExecutor(self._threads) as pool:
-            following = self._begin_cuts(pool, examples)
+
+            def begin() -> list[tuple[FullDetailPicture, Future[Index]]]:
+                some = itertools.islice(examples, AHEAD)
+                return [(picture, pool.submit(self.nodes.cut, picture.camera, share)) for picture, share in some]
+
+            following = begin()
             while group := following:
                 cuts = [cut.result() for _, cut in group]
                 self._optimiser.place()
-                following = self._begin_cuts(pool, examples)
+                following = begin()
                 yield from zip((picture for picture, _ in group), cuts, strict=True)
             self._optimiser.place()
 
-    def _begin_cuts(
-        self, pool: Executor, examples: Iterator[tuple[FullDetailPicture, float]]
-    ) -> list[tuple[FullDetailPicture, Future[Index]]]:
-        """Return the next AHEAD pictures, with cuts that a pool finds."""
-        some = itertools.islice(examples, AHEAD)
-        return [(picture, pool.submit(self.nodes.cut, picture.camera, share)) for picture, share in some]
-
-    def describe_stage(self) -> str:
-        stage, before = self._stages[-1], self._before
-        after = stage.psnr_after
-        changes = (f"{percent_of(share)} {before[share]:.2f} -> {after[share]:.2f} dB" for share in after)
-        return f"{stage.name}: {', '.join(changes)}"
-
     def finish(self, is_complete: bool) -> tuple[Splats, Refined]:
-        """Return the best nodes, where those that break a law have their first values, and the report."""
+        """Return the best nodes, restored where they break a law, and the report."""
         self.nodes.restore(self.nodes.fitted, self._kept)
         after = self._lawful() if self._stages else self._before
         kept = float(self.nodes.changed()[self.nodes.fitted].mean()) if self.nodes.fitted.size else 0.0
@@ -255,7 +252,7 @@ class _Fitting:
         return self.nodes.result(), report
 
     def _lawful(self) -> Scores:
-        """Undo changes that break a law, and return the scores of the nodes."""
+        """Undo the changes that break a law; return the scores of the nodes."""
         for _ in range(TRIES):
             keep_sizes(self.nodes)
             after = keep_gains(self.nodes, self._held_out, self._before)

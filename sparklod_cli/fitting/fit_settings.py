@@ -13,7 +13,7 @@ from . import FIT_DEVICE_HELP, SEED, SEED_HELP, STEPS
 if TYPE_CHECKING:
     from ..cameras.sources import CameraPath
 
-#: Shares of the leaves at which trees are judged.
+#: Sizes of the cuts by which trees are scored, as shares of the leaves.
 SHARES = (0.02, 0.05, 0.1, 0.25, 0.5)
 
 
@@ -22,7 +22,7 @@ class FitSettings(CheckedSettings):
     """Settings of fitting the merged splats of a tree.
 
     Attributes:
-        path: training cameras; None for cameras that are placed around and inside the scene.
+        path: training cameras; None for random cameras around and inside the scene.
     """
 
     steps: int | None = setting(

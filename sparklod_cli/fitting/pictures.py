@@ -1,4 +1,4 @@
-"""Nodes while they are fitted, cameras, pictures of full detail, what nodes must keep, and steps of the optimiser."""
+"""Nodes under change, cameras, pictures of full detail, laws of fitted nodes, and steps of the optimiser."""
 
 from __future__ import annotations
 
@@ -36,42 +36,42 @@ Index = NDArray[np.int64]
 
 
 class FittedNodes:
-    """The nodes of a tree while they change.
+    """The nodes of a tree under change.
 
     Attributes:
-        columns: of the nodes, as they are now; changed in place.
-        old: the columns as they were at first.
+        columns: current columns of the nodes, changed in place.
+        old: the original columns.
         leaves: indices of full detail, ascending.
         fitted: indices of the nodes that may change, ascending: the merged splats.
-        shares: of the leaves, of the cuts that nodes are judged by.
+        shares: sizes of the cuts that are scored, as shares of the leaves.
     """
 
     shares: Sequence[float] = SHARES
 
-    #: Bounds of what fitting changes. Feature sizes decide which nodes a cut refines, and the builder chose them well.
+    #: Bounds of changes. Feature sizes decide which nodes a cut refines, and those of the builder are good.
     #: Measured (benchmarks/notes/refining.md).
     bounds = FitBounds(MOST_D, np.float32(1.06))
 
-    #: Least feature size of a node, over the mean of its children's, weighted by opacity times surface. `inspect
-    #: --check` warns below a third, also after rounding to the steps of a format.
+    #: Least ratio of a node's feature size to the mean of its children's, weighted by opacity times surface. `inspect
+    #: --check` warns below a third, which the rounding of a format must not reach.
     least_ratio = 0.38
 
     def __init__(self, nodes: Splats, tree: LodTree, raster: RasterSettings, threads: int) -> None:
         self.original, self.tree, self.raster = nodes, tree, raster
         self.old = columns_of(nodes)
-        self.columns = _copied(self.old)
+        self.columns = Columns(*(column.copy() for column in self.old))
         self.leaves: Index = np.flatnonzero(tree.is_leaf)
         self.fitted: Index = np.flatnonzero(~tree.is_leaf)
         self._forest = Forest([nodes_of(nodes, tree, None, precision="float16", threads=threads)])
         self._viewer = SparkViewer(self._forest, [TreeInstance(foveation=Cones())])
 
     def cut(self, camera: Camera, share: float) -> Index:
-        """Return the nodes, ascending, of a cut of a share of the leaves, without pixel-scale limit or foveation."""
+        """Return the nodes, ascending, of a cut with a share of the leaves, without pixel-scale limit or foveation."""
         budget = max(1, int(share * len(self.leaves)))
         return self._viewer.cut(camera, budget=budget).indices()[0].astype(np.int64)
 
     def visible(self, index: Index, camera: Camera) -> tuple[Index, ShadedSplats]:
-        """Return the nodes of `index` that a camera may see, and how it sees them."""
+        """Return the nodes of `index` that may be visible to a camera, and their shaded splats."""
         now = self.columns
         whole = ShadedSplats(now.center, now.scale, now.quat_xyzw, now.lod_opacity, now.rgb)
         _, matrix, lens, limits = rasterizer.arguments(whole, camera, self.raster)
@@ -86,29 +86,31 @@ class FittedNodes:
         return seen, ShadedSplats(found.center, found.scale, found.quat_xyzw, found.lod_opacity, found.rgb)
 
     def renew(self, index: Index) -> None:
+        """Update the nodes that cuts are found with from the current columns."""
         self.place(index, self.columns.center[index], self.sizes(index))
 
-    @np.errstate(over="ignore")  # what float16 cannot hold is infinite, as in Spark
+    @np.errstate(over="ignore")  # numbers beyond float16 become infinite, as in Spark
     def place(self, index: Index, center: FloatArray, sizes: FloatArray) -> None:
-        """Set centres, (M, 3), and feature sizes of the nodes that cuts are found with."""
+        """Set (M, 3) centres and (M,) feature sizes of the nodes that cuts are found with."""
         rows = self._forest.nodes
         rows["x"][index], rows["y"][index], rows["z"][index] = center.astype(np.float16).T
         rows["size"][index] = sizes.astype(np.float16)
 
     def sizes(self, index: Index, columns: Columns | None = None) -> FloatArray:
-        """Return feature sizes of some nodes as they are now, or by other columns; see `gaussian.spark_size`."""
+        """Return feature sizes by the current or other columns; see `gaussian.spark_size`."""
         columns = columns or self.columns
         x, y, z = columns.scale[index].T
         size: FloatArray = size_factor(columns.lod_opacity[index]) * 2 * ((x + y + z) / np.float32(3))
         return size
 
     def restore(self, index: Index, columns: Columns | None = None) -> None:
-        """Set some nodes to the values of other columns, or to their first ones."""
+        """Set nodes to the values of other columns; to the original values by default."""
         for now, other in zip(self.columns, columns or self.old, strict=True):
             now[index] = other[index]
         self.renew(index)
 
     def halve(self, index: Index) -> None:
+        """Move nodes halfway back to their original values."""
         for now, old in zip(self.columns, self.old, strict=True):
             now[index] = (now[index] + old[index]) / 2
         turned = index[(self.columns.quat_xyzw[index] != self.old.quat_xyzw[index]).any(axis=1)]
@@ -116,15 +118,16 @@ class FittedNodes:
         self.renew(index)
 
     def copy(self) -> Columns:
-        return _copied(self.columns)
+        """Return a copy of the current columns."""
+        return Columns(*(column.copy() for column in self.columns))
 
     def changed(self) -> NDArray[np.bool_]:
-        """Return a (N,) mask of the nodes that differ from their first values."""
+        """Return a (N,) mask of the nodes that differ from their original values."""
         pairs = zip(self.columns, self.old, strict=True)
         return np.logical_or.reduce([(a != b).reshape(len(a), -1).any(axis=1) for a, b in pairs])
 
     def result(self) -> Splats:
-        """Return all nodes as they are now; what has not changed is the same bit for bit."""
+        """Return all nodes; unchanged values are the original ones bit for bit."""
         now = self.columns
         opacity = np.where(
             now.lod_opacity == self.old.lod_opacity, self.original.opacity, linear_opacity(now.lod_opacity)
@@ -133,9 +136,9 @@ class FittedNodes:
 
 
 class FittedSet(FittedNodes):
-    """The nodes of one cut, `fixed`, for all cameras while they change, leaves too; none gets an opacity above 1."""
+    """The nodes of one cut, `fixed`, drawn for all cameras: leaves change, too, and opacities stay at most 1."""
 
-    #: No camera chooses among the nodes by their sizes; single scales are limited, see `adam.MOST_CHANGE`.
+    #: Cuts do not depend on sizes here; single scales are limited, see `adam.MOST_CHANGE`.
     bounds, least_ratio = FitBounds(np.float32(1), np.float32(np.inf)), 0.0
 
     def __init__(self, nodes: Splats, tree: LodTree, fixed: Index, raster: RasterSettings, threads: int) -> None:
@@ -149,12 +152,8 @@ class FittedSet(FittedNodes):
 
 
 def columns_of(nodes: Splats) -> Columns:
-    """Return the columns of nodes as they are fitted."""
+    """Return the columns of nodes that fitting changes."""
     return Columns(nodes.center, nodes.scale, nodes.quat_xyzw, lod_opacity(nodes.opacity), nodes.rgb, nodes.sh)
-
-
-def _copied(columns: Columns) -> Columns:
-    return Columns(*(column.copy() for column in columns))
 
 
 Vector = NDArray[np.float64]
@@ -162,22 +161,23 @@ Vector = NDArray[np.float64]
 #: Pixels of a picture. Larger ones gain less in the same time. Measured (benchmarks/notes/refining.md).
 SIZE = (480, 270)
 
-#: Cameras around the scene: their distances in radii, and the share of them that stand near the horizon.
+#: Cameras around the scene: their distances in radii, and the share of cameras near the horizon.
 DISTANCES, NEAR_HORIZON = (0.5, 5.0), 0.5
 
-#: Largest sine of the elevation of those near the horizon.
+#: Largest sine of the elevation of cameras near the horizon.
 HORIZON = 0.5
 
-#: Share of the cameras that stand among the splats.
+#: Share of the cameras inside the scene, among the splats.
 INSIDE = 0.25
 
 #: Vertical fields of view, degrees.
 FOVS = (35.0, 75.0)
 
-#: Cameras look at a point this far from the middle at most, in radii, and in distances.
+#: Largest distance of the target of a camera from the middle, in radii, and in distances of the camera.
 ASIDE_RADII, ASIDE_DISTANCES = 0.4, 0.25
 
-#: Training cameras at most. Their pictures, 1 MB each, are drawn once. Measured (benchmarks/notes/refining.md).
+#: Maximum number of training cameras. Their pictures, 1 MB each, are drawn once. Measured
+#: (benchmarks/notes/refining.md).
 TRAINING = 300
 
 #: Largest number of held-out cameras, and the smallest interval at which cameras of a path are held out.
@@ -186,7 +186,7 @@ HELD_OUT, OF_PATH = 16, 8
 #: Longest side of a picture of a path's camera, pixels.
 LONGEST = 640
 
-#: Which way is up, in the axes of scenes as training leaves them.
+#: Up direction of scenes from training.
 UP = np.array([0.0, -1.0, 0.0])
 
 #: Steps of the R2 sequence (Roberts 2018): the generalized golden ratio in three dimensions.
@@ -196,7 +196,7 @@ R3 = np.array([1 / _PLASTIC, 1 / _PLASTIC**2, 1 / _PLASTIC**3])
 
 @dataclass(frozen=True)
 class Place:
-    """Extent of a scene: (N, 3) centres of splats, world units, and the middle and radius of a ball around most."""
+    """Extent of a scene: (N, 3) centres of splats, world units; middle and radius of a ball with most of them."""
 
     center: NDArray[np.floating]
     middle: Vector
@@ -204,11 +204,12 @@ class Place:
 
     @classmethod
     def of(cls, center: NDArray[np.floating]) -> Place:
+        """Return the extent of centres."""
         return cls(center, *framing(center))
 
 
 def placed(place: Place, seed: np.random.SeedSequence) -> Iterator[Camera]:
-    """Yield cameras around a scene and inside it, without end; directions of those around it spread evenly."""
+    """Yield cameras around a scene, in evenly spread directions, and cameras inside it, without end."""
     random = np.random.Generator(np.random.PCG64(seed))
     start = random.random(3)
     number = 0
@@ -221,7 +222,7 @@ def placed(place: Place, seed: np.random.SeedSequence) -> Iterator[Camera]:
 
 
 def _around(place: Place, spread: Vector, random: np.random.Generator) -> Camera:
-    """Return a camera outside, by three numbers 0..1 for its direction and distance."""
+    """Return a camera around the scene; `spread` are three numbers 0..1 for its direction and distance."""
     near, far = np.log(DISTANCES)
     distance = float(np.exp(near + (far - near) * spread[2])) * place.radius
     sine = 2 * spread[1] - 1
@@ -234,7 +235,7 @@ def _around(place: Place, spread: Vector, random: np.random.Generator) -> Camera
 
 
 def _inside(place: Place, random: np.random.Generator) -> Camera:
-    """Return a camera between two splats that looks at a third one, all of them in the ball."""
+    """Return a camera midway between two random splats that looks at a third."""
     target = _some(place, random)
     eye = (_some(place, random) + _some(place, random)) / 2
     if np.linalg.norm(target - eye) < 1e-3 * place.radius:
@@ -243,12 +244,13 @@ def _inside(place: Place, random: np.random.Generator) -> Camera:
 
 
 def _some(place: Place, random: np.random.Generator) -> Vector:
-    """Return the (3,) centre of a random splat, pulled into the ball."""
+    """Return the (3,) centre of a random splat, moved into the ball if outside."""
     away: Vector = place.center[random.integers(len(place.center))] - place.middle
     return place.middle + away * min(1.0, place.radius / max(float(np.linalg.norm(away)), 1e-30))
 
 
 def _looking(eye: Vector, target: Vector, random: np.random.Generator) -> Camera:
+    """Return a camera of a random field of view at a point, directed at another."""
     up = UP
     ahead = (target - eye) / np.linalg.norm(target - eye)
     if abs(ahead @ UP) > 0.99:  # straight up or down
@@ -257,7 +259,7 @@ def _looking(eye: Vector, target: Vector, random: np.random.Generator) -> Camera
 
 
 def split_path(path: CameraPath) -> tuple[tuple[Camera, ...], tuple[Camera, ...]]:
-    """Return the training and the held-out cameras of a path, at most `LONGEST` pixels a side; one camera is both."""
+    """Divide the cameras of a path, resized by `smaller`, into training and held-out ones; a single camera is both."""
     cameras = tuple(map(smaller, path.cameras))
     every = max(OF_PATH, -(-len(cameras) // HELD_OUT))
     held_out = cameras[every // 2 :: every] or cameras[-1:]
@@ -267,7 +269,7 @@ def split_path(path: CameraPath) -> tuple[tuple[Camera, ...], tuple[Camera, ...]
 
 
 def smaller(camera: Camera) -> Camera:
-    """Return the same camera with a picture of at most `LONGEST` pixels a side."""
+    """Return the camera with its picture reduced to at most `LONGEST` pixels a side."""
     share = LONGEST / max(camera.width, camera.height)
     if share >= 1:
         return camera
@@ -279,19 +281,19 @@ def smaller(camera: Camera) -> Camera:
     )
 
 
-#: Least mean alpha of a picture, and least standard deviation of its colours over grey: else there is nothing to see.
+#: Least mean alpha of a picture, and least standard deviation of its colours over grey, for pictures worth comparing.
 COVERED, VARIED = 0.02, 0.01
 
-#: Added to the mean squared error of a picture, that of 50 dB: what is better already hardly counts.
+#: Added to the mean squared error of a picture: the error at 50 dB, so that better pictures hardly count.
 LEAST_ERROR = 1e-5
 
-#: Cameras in a row that see too little, after which no more are tried.
+#: Number of successive cameras that see too little, after which no more are tried.
 MOST_MISSES = 64
 
 #: Share of the leaves -> mean PSNR, dB.
 Scores = dict[float, float]
 
-#: Times that half of what was changed is taken back, before all is.
+#: Number of times that changes are halved before they are undone.
 HALVES = 12
 
 
@@ -300,21 +302,21 @@ class FullDetailPicture:
     """Picture of full detail from one camera.
 
     Attributes:
-        full: (H, W, 4) uint16 of full detail in units of 1 / 65535: colours multiplied by alpha, and alpha.
+        full: (H, W, 4) uint16, colours multiplied by alpha, and alpha, in units of 1 / 65535.
     """
 
     camera: Camera
     full: NDArray[np.uint16]
 
     def errors(self, image: Image) -> tuple[float, float]:
-        """Return the mean squared errors of a picture on black and on white."""
+        """Return the mean squared errors of another picture, on black and on white."""
         sums = np.empty((len(image), 2))
         squared_differences(len(image), image, self.full, sums)
         black, white = sums.sum(axis=0) / (image.shape[0] * image.shape[1] * 3)
         return float(black), float(white)
 
     def gradient(self, image: Image) -> Image:
-        """Return the derivative of the mean logarithm of `errors`, as in PSNR."""
+        """Return the derivative of the mean logarithm of `errors`, by each value of the other picture."""
         result, pixels = np.empty_like(image), image.shape[0] * image.shape[1] * 3
         errors = [error + LEAST_ERROR for error in self.errors(image)]
         by_image(len(image), image, self.full, *(np.float32(1 / (pixels * error)) for error in errors), result)
@@ -322,7 +324,7 @@ class FullDetailPicture:
 
 
 def pictures(cameras: Iterator[Camera], nodes: FittedNodes) -> Iterator[FullDetailPicture]:
-    """Yield the pictures of full detail of cameras that see enough to compare cuts by; end if hardly any does."""
+    """Yield the pictures of the cameras that see enough; end after too many that do not."""
     misses = 0
     for camera in cameras:
         full = draw(nodes.visible(nodes.leaves, camera)[1], camera, nodes.raster)
@@ -336,7 +338,7 @@ def pictures(cameras: Iterator[Camera], nodes: FittedNodes) -> Iterator[FullDeta
 
 
 def scores_of(nodes: FittedNodes, held_out: Sequence[FullDetailPicture]) -> Scores:
-    """Return the means over held-out pictures and a black and a white background; empty without pictures."""
+    """Return the `mean_psnr` of the cut of each share; empty without pictures."""
     return {
         share: mean_psnr(nodes, functools.partial(nodes.cut, share=share), held_out)
         for share in (nodes.shares if held_out else ())
@@ -344,7 +346,7 @@ def scores_of(nodes: FittedNodes, held_out: Sequence[FullDetailPicture]) -> Scor
 
 
 def mean_psnr(nodes: FittedNodes, cut: Callable[[Camera], Index], compared: Sequence[FullDetailPicture]) -> float:
-    """Return the mean PSNR of a camera's cuts over pictures and a black and a white background, dB."""
+    """Return the mean PSNR, dB, of each camera's cut over pictures, on a black and on a white background."""
     psnr: list[float] = []
     for picture in compared:
         _, shaded = nodes.visible(cut(picture.camera), picture.camera)
@@ -353,14 +355,14 @@ def mean_psnr(nodes: FittedNodes, cut: Callable[[Camera], Index], compared: Sequ
 
 
 def gain(before: Scores, after: Scores) -> float:
-    """Return the mean gain in dB."""
+    """Return the mean gain over all shares, dB."""
     return float(np.mean([after[share] - before[share] for share in before]))
 
 
 def keep_sizes(nodes: FittedNodes) -> bool:
-    """Restore nodes that became too small for their children, unless they were so at first; return True if any were.
+    """Restore nodes that became too small for their children, and were not so originally; return True if there are any.
 
-    A parent is refined before its children if it is larger; a small one is drawn in their place for too long
+    A parent is refined before its children if it is larger; a small parent is drawn in their place for too long
     (docs/decisions/11-quality-builder.md).
     """
     parent, _ = find_parents(nodes.tree.child_count, nodes.tree.child_start)
@@ -370,7 +372,7 @@ def keep_sizes(nodes: FittedNodes) -> bool:
         small = _ratios(nodes.columns, nodes, parent) < np.minimum(nodes.least_ratio, at_first)
         if not small.any():
             break
-        # Where the node itself has its first values already, its children have grown.
+        # If the node itself is restored already, its children have grown.
         grown = np.flatnonzero((parent >= 0) & (small & restored)[parent] & ~nodes.tree.is_leaf)
         back = np.union1d(np.flatnonzero(small & ~restored), grown)
         back = back[~restored[back]]
@@ -382,7 +384,7 @@ def keep_sizes(nodes: FittedNodes) -> bool:
 
 
 def _ratios(columns: Columns, nodes: FittedNodes, parent: Index) -> FloatArray:
-    """Return the (N,) feature size of each node over the mean of its children's; infinite for leaves."""
+    """Return the (N,) ratios of each node's feature size to the mean of its children's; infinite for leaves."""
     every = np.arange(len(parent))
     size, weight = nodes.sizes(every, columns), np.empty(len(parent))
     fill_weights(parent, size, columns.scale, linear_opacity(columns.lod_opacity), weight)
@@ -392,7 +394,7 @@ def _ratios(columns: Columns, nodes: FittedNodes, parent: Index) -> FloatArray:
 
 
 def keep_gains(nodes: FittedNodes, held_out: Sequence[FullDetailPicture], before: Scores) -> Scores:
-    """Halve changes of the nodes that cuts of a share draw, while one scores less than before; return the scores."""
+    """Halve the changes of the nodes in cuts that score less than before, until none does; return the scores."""
     for _ in range(HALVES):
         now = scores_of(nodes, held_out)
         worst = min(before, key=lambda share: now[share] - before[share])
@@ -420,6 +422,7 @@ class Optimiser:
         )
 
     def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
+        """Move the nodes of a cut towards a picture of full detail."""
         nodes, camera = self.nodes, picture.camera
         seen, shaded = nodes.visible(index, camera)
         drawing = gradients.draw(shaded, camera, nodes.raster)
@@ -433,17 +436,17 @@ class Optimiser:
         self._moved.append(seen)
 
     def place(self) -> None:
-        """Update the nodes that cuts are found with, by the steps since the last call."""
+        """Update the nodes that cuts are found with by the steps since the last call."""
         for seen in self._moved:
             self.nodes.renew(seen)
         self._moved.clear()
 
     def synchronize(self) -> None:
-        """Update the columns of the nodes, which are always up to date here."""
+        """Update the columns of the nodes; here they are always current."""
 
 
 def slots_of(nodes: FittedNodes) -> NDArray[np.int32]:
-    """Return the row of each node in `Moments`, -1 for those that do not change."""
+    """Return the (N,) row of each node in `Moments`, -1 for nodes that do not change."""
     slots = np.full(len(nodes.tree), -1, np.int32)
     slots[nodes.fitted] = np.arange(len(nodes.fitted), dtype=np.int32)
     return slots

@@ -8,19 +8,19 @@ from fractions import Fraction
 
 from ..system.units import check_grouping, count_of, parse_count
 
-#: A share of the leaves, in percent, with at most nine digits after the point.
+#: A share of the leaves, in percent, with at most nine decimals.
 SHARE = re.compile(r"([0-9]{1,3}(?:\.[0-9]{1,9})?|\.[0-9]{1,9})\s*%")
 
-#: A share that is not in percent.
+#: A share without the percent sign.
 FRACTION = re.compile(r"0?\.[0-9]{1,9}")
 
-#: A comma that groups digits: no budget of a list begins with a zero.
+#: A comma that groups digits, as no budget of a list begins with a zero.
 GROUPED_LIST = re.compile(r"[0-9],0")
 
-#: Smaller counts are probably meant as a share or as thousands: they draw nothing recognisable.
+#: Smaller counts draw nothing recognisable: probably a share or thousands are meant.
 FEW = 100
 
-#: The largest count: up to it, every table format stores integers exactly.
+#: Largest count: every table format stores integers up to this exactly.
 LARGEST = 1 << 53
 
 
@@ -33,7 +33,7 @@ class Budget:
         share: share of the leaves of all instances together; None for a count.
         count: number of splats; None for a share.
         scale: factor for the budget, Spark's `lodSplatScale`.
-        by_default: not chosen by the user, so that viewers of other formats take their own default.
+        by_default: not chosen by the user; viewers other than Spark then use their own defaults.
     """
 
     text: str
@@ -44,20 +44,20 @@ class Budget:
 
     @classmethod
     def of_count(cls, count: int) -> Budget:
-        """Return a budget of this many splats."""
+        """Return a budget of a number of splats."""
         return cls(f"{count}", None, count)
 
     def of(self, leaves: int) -> int:
-        """Return the number of splats, at least 1, for instances with this many leaves in total."""
+        """Return the number of splats, at least 1, for a total number of leaves."""
         splats = self.count if self.share is None else self.share * leaves
         assert splats is not None
         return max(1, int(splats if self.scale == 1 else float(splats) * self.scale))
 
 
 def doubt(count: int | None, *, shares: bool = True) -> str:
-    """Return a question about a number of splats that is probably a mistake; empty for other numbers and None.
+    """Return a question about a suspiciously small number of splats, else an empty text.
 
-    `shares`: a share is allowed, too.
+    `shares`: suggest a share, too.
     """
     share = f" or {count}%" if shares else ""
     few = count is not None and count < FEW
@@ -65,7 +65,7 @@ def doubt(count: int | None, *, shares: bool = True) -> str:
 
 
 def parse_budget(text: str) -> Budget:
-    """Return the budget of a text such as "5%" or "500k".
+    """Parse a budget such as "5%" or "500k".
 
     Raises:
         ValueError: the text is neither a share nor a count, or is out of range (0, or a count beyond `LARGEST`).
@@ -86,7 +86,7 @@ def parse_budget(text: str) -> Budget:
 
 
 def parse_budgets(text: str) -> tuple[Budget, ...]:
-    """Return the budgets of a text such as "2%,5%,500k"; raise `ValueError` if one is invalid, or there is none."""
+    """Parse budgets such as "2%,5%,500k"; raise `ValueError` if one is invalid, or there is none."""
     if GROUPED_LIST.search(text):
         check_grouping(text)
     budgets = tuple(map(parse_budget, filter(None, map(str.strip, text.split(",")))))

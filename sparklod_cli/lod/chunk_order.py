@@ -1,15 +1,15 @@
-"""Orders of the nodes of a tree: for streaming, in chunks of which viewers need as few as possible, and in bands.
+"""Orders of the nodes of a tree: for streaming, so that viewers need few chunks, and in bands, for files read whole.
 
-A viewer fetches a tree chunk by chunk. It needs the chunks that hold the children of the nodes that it refines, so the
-unit of an order is the *family*, the children of one node. The first chunk holds the largest families: a coarse picture
-of the whole. The rest is split in two, again and again, until each part is a chunk: along x, y or z between subtrees,
-or by size, where the coarse part comes first. Of these, the split is reordered after which viewers at quasi-random
-viewpoints, with budgets of all sizes, are expected to fetch the fewest bytes; docs/streaming.md says how it compares.
+A viewer fetches a tree chunk by chunk. It needs the chunks with the children of the nodes that it refines, so the unit
+of an order is the *family*, the children of one node. The first chunk holds the largest families: a coarse picture of
+the whole. The rest is split in two, again and again, until each part is a chunk: along x, y or z between subtrees, or
+by size, the coarse part first. The split is chosen after which viewers at quasi-random viewpoints, with budgets of all
+sizes, are expected to fetch the fewest bytes; docs/streaming.md compares it with other orders.
 
-The order in bands is for files that are read whole. It goes from coarse to fine in few bands, each of them along the
-tree. Neighbours in a file compress together if they are neighbours in space. A builder's order goes through the scene
-once for each step of size; this one goes through it once a band, from subtree to subtree. At the end of each band the
-nodes up to there are an even, coarser scene. benchmarks/notes/file-sizes.md has what that saves.
+The order in bands goes from coarse to fine in few bands, and within a band from subtree to subtree, so that neighbours
+in a file, which compress together, are neighbours in space. The order of a builder goes through the scene once for each
+step of size. The nodes up to the end of a band are an even, coarser scene. benchmarks/notes/file-sizes.md has the
+savings.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from .kernels.sort import sort_by_key
 from .kernels.tree_links import find_limits, find_parents
 
 #: Viewpoints: half outside of the scene looking at it, a quarter anywhere inside, a quarter near a node. Chosen: 16
-#: are as good for large trees, not for those of four chunks (benchmarks/notes/cuts-and-chunks.md).
+#: are as good for large trees, but not for trees of four chunks (benchmarks/notes/cuts-and-chunks.md).
 VIEWPOINTS = 64
 
 #: Distances of viewpoints from the middle of the scene, or from a node, in radii of the scene: log-uniform. Chosen.
@@ -41,24 +41,24 @@ OUTSIDE, NEAR = (0.5, 4.0), (0.02, 0.2)
 #: Share of the centres, at either end of each axis, that the box of the scene leaves out. Chosen.
 OUTLIERS = 0.02
 
-#: Coordinates of viewpoints end where float32 does: scenes may reach that far themselves.
+#: Largest coordinate of a viewpoint: that of float32, which scenes may have, too.
 LARGEST = float(np.finfo(np.float32).max)
 
-#: Least budget of viewers, as a share of the nodes, and at most one chunk. Chosen.
+#: Least budget of viewers, as a share of the nodes; at most one chunk. Chosen.
 LEAST_BUDGET = 1 / 16
 
 #: Bases of the Halton sequences that viewpoints are made of.
 PRIMES = (2, 3, 5, 7, 11, 13, 17)
 
-#: Families that a bake out of core puts in order at a time: those of some 15 million splats. Chosen: 0.7 GB.
+#: Families that a bake out of core orders at a time: those of some 15 million splats. Chosen: 0.7 GB.
 MOST_FAMILIES = 1 << 22
 
-#: Bytes of a family while it is put in order, besides the bytes of each thread. Measured.
+#: Bytes of a family while it is ordered, besides the bytes of each thread. Measured.
 FAMILY_BYTES = 124
 
-#: Nodes of the first band, and how many times more there are at the end of each band than at that of the one before.
-#: Measured: with 8 instead of 4 files are up to 0.5 % smaller, and in no bands up to 0.9 %, but fewer prefixes are even
-#: scenes then (benchmarks/notes/file-sizes.md).
+#: Nodes of the first band, and growth of the number of nodes from the end of a band to the end of the next. Measured:
+#: with a growth of 8, files are up to 0.5 % smaller, and without bands up to 0.9 %, but fewer prefixes are even scenes
+#: (benchmarks/notes/file-sizes.md).
 FIRST_BAND, BAND_GROWTH = 4096, 4
 
 #: Sign bit of a float32.
@@ -67,16 +67,15 @@ SIGN = np.uint32(1 << 31)
 Matrix = NDArray[np.float64]
 Index = NDArray[np.int32]
 
-#: Families processed at a time on the way up the tree. Chosen.
+#: Families per block on the way up the tree. Chosen.
 _ROWS = 1 << 16
 
 
 def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tuple[Splats, LodTree]:
-    """Return the same tree with its nodes in the order for streaming.
+    """Put the nodes of a tree into the order for streaming.
 
-    The root is node 0, siblings are consecutive and come after their parent. No siblings lie in two chunks, unless
-    families are so large that chunks cannot be filled with whole ones. The result does not depend on the number of
-    threads.
+    The root is node 0, siblings are consecutive and come after their parent. Siblings lie in one chunk, unless families
+    are too large to fill chunks with whole families. The result does not depend on the number of threads.
     """
     order, child_start = chunk_order(splats, tree, progress=progress)
     return reordered([(splats, tree)], order, child_start)
@@ -85,7 +84,7 @@ def arrange(splats: Splats, tree: LodTree, *, progress: Progress = silent) -> tu
 def chunk_order(
     splats: Splats, tree: LodTree, *, progress: Progress = silent
 ) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """Return the order of `arrange`: (M,) uint32 the node, and (M,) uint32 the `child_start`, of each place."""
+    """Return the order of `arrange`; see `node_order`."""
     nodes, parent = families_of(tree)
     if not len(nodes):
         return node_order(tree, nodes)
@@ -103,24 +102,24 @@ def family_order(
     most: int | None = None,
     progress: Progress = silent,
 ) -> Index:
-    """Return the order of families of `arrange`.
+    """Return the order of the families of `arrange`.
 
     Args:
-        parent: (F,) for each node that has children, in any order in which parents come first, the place here of its
-            parent; -1 for the root.
-        count, center, size: of each, number of children, centre and feature size, world units.
-        most: number of families that are put in order at a time, see `family_bytes`; None for all. Parts, see
-            `parts_of`, are each put in order as if they were a tree, one after the other.
+        parent: (F,) for each node that has children, the place of its parent among these nodes, which comes before it;
+            -1 for the root.
+        count, center, size: number of children, centre and feature size of each node, world units.
+        most: number of families that are ordered at a time, see `family_bytes`; None for all. Each of the parts, see
+            `parts_of`, is ordered like a tree of its own.
 
     Returns:
-        (F,) int32 places here, in the order in which the children are written.
+        (F,) int32 places of the nodes in the order in which their children are written.
     """
     total, filled, found = 1 + int(count.sum(dtype=np.int64)), 1, []
     size = np.fmax(size, np.float32(0))
     _, limit = find_limits(parent, size)
     for members in parts_of(parent, center, limit, most or len(parent)):
         with threads_for(len(members)) as threads:
-            at = slice(None) if len(members) == len(parent) else members  # without a copy of all
+            at = slice(None) if len(members) == len(parent) else members  # a slice copies nothing
             # Parents first: by descending limit.
             keys = np.uint64(0x7FFFFFFF) - limit[at].view(np.uint32).astype(np.uint64)
             largest = sort_by_key(keys, np.arange(len(members), dtype=np.uint32), 31, threads)[1]
@@ -133,17 +132,17 @@ def family_order(
 
 
 def family_bytes(threads: int) -> int:
-    """Return the bytes that each of the families takes that are put in order at a time."""
+    """Return the memory for each of the families that are ordered at a time, bytes."""
     return FAMILY_BYTES + DEMAND_BYTES * min(threads, VIEWPOINTS // LANES)
 
 
 def _part(parent: Index, members: Index) -> Index:
-    """Return the place of the parent of each member among the ascending members; -1 for other parents."""
+    """Return the place of each member's parent among the ascending members; -1 if it is not a member."""
     if len(members) == len(parent):
         return parent
     place = np.full(len(parent) + 1, -1, np.int32)
     place[members] = np.arange(len(members), dtype=np.int32)
-    return place[parent[members]]  # -1, of no parent, is the place behind all
+    return place[parent[members]]  # the parent -1 of the root finds the last place, -1
 
 
 def _families(
@@ -171,6 +170,7 @@ def _families(
 
 
 def _places(order: NDArray[np.uint32]) -> Index:
+    """Return the place of each number in an order: the inverse permutation."""
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     return place
@@ -187,13 +187,13 @@ def _ranks(center: FloatArray, threads: int) -> NDArray[np.int32]:
 
 
 def _sequence(families: Families, filled: int, total: int, progress: Progress) -> Index:
-    """Return the (F,) families of a part in the order in which they are written, after `filled` of `total` nodes."""
+    """Return the (F,) families of a part in their final order, which begins after `filled` of `total` nodes."""
     length, own = len(families.count), int(families.count.sum(dtype=np.int64))
     sequence = np.arange(length, dtype=np.int32)
     set_of, root, spare = (np.full(length, -1, np.int32) for _ in range(3))
     weight = np.empty(length, np.int64)
-    # Begin and end of each set, its nodes, and for the first set the number of nodes that fit into the chunk that the
-    # root or the part before has begun.
+    # Begin and end of each set, its nodes, and for the first set the room for nodes in the chunk that the root or the
+    # part before has begun.
     room = -filled % CHUNK_NODES
     sets, ends, used = ([(0, length, own, room)] if room or own > CHUNK_NODES else []), [0, length], 0
     while sets:
@@ -244,7 +244,7 @@ def viewpoints(centers: FloatArray) -> NDArray[np.void]:
 
 
 def _halton(base: int) -> Matrix:
-    """Return VIEWPOINTS elements of the Halton sequence from the second on, evenly spread in 0..1."""
+    """Return VIEWPOINTS elements of the Halton sequence, from the second on: evenly spread in 0..1."""
     left, share, out = np.arange(1, VIEWPOINTS + 1), 1.0, np.zeros(VIEWPOINTS)
     while left.any():
         share /= base
@@ -254,14 +254,14 @@ def _halton(base: int) -> Matrix:
 
 
 def _on_sphere(u: Matrix, v: Matrix) -> Matrix:
-    """Return the (N, 3) directions, evenly spread if (u, v) are so in the unit square."""
+    """Map (u, v), evenly spread in the unit square, to (N, 3) directions, evenly spread on the sphere."""
     z = 2 * u - 1
     across = np.sqrt(1 - z * z)
     return np.stack([across * np.cos(2 * np.pi * v), across * np.sin(2 * np.pi * v), z], axis=1)
 
 
 def _log_uniform(bounds: tuple[float, float], u: Matrix) -> Matrix:
-    """Return the (N, 1) numbers between bounds, with logarithms spread as u is in 0..1."""
+    """Map (N,) numbers 0..1 to (N, 1) numbers between bounds, linearly in their logarithms."""
     low, high = bounds
     return low * (high / low) ** u[:, None]
 
@@ -269,16 +269,16 @@ def _log_uniform(bounds: tuple[float, float], u: Matrix) -> Matrix:
 def parts_of(
     parent: Index, center: FloatArray, limit: FloatArray, most: int, members: Index | None = None
 ) -> Iterator[Index]:
-    """Yield all families in parts of at most `most`, of which none comes before the one that has its parent.
+    """Yield all families in parts of at most `most`; the part of a family never precedes the part of its parent.
 
-    The largest families are the first part. The rest is subtrees below them: neighbouring subtrees are parts together,
-    and one that is too large is divided like the tree. The peak is about 50 bytes a family.
+    The first part has the largest families. Each of the others has neighbouring subtrees below them; a subtree that is
+    too large is divided like the tree. The peak is about 50 bytes a family.
 
     Args:
         parent: (F,) int32 family of each family's parent, which comes before it; -1 for the root.
         center: (F, 3) of the parents.
-        limit: (F,) the least size from the root to the parent.
-        members: (N,) families of a subtree, ascending; all unless given.
+        limit: (F,) least size from the root to the parent.
+        members: (N,) families of a subtree, ascending; all by default.
     """
     if members is None:
         members = np.arange(len(parent), dtype=np.int32)
@@ -296,7 +296,7 @@ def parts_of(
     root = number_of[root]
     del number_of
     weight = np.zeros(len(roots), np.int64)
-    for part in blocks_of(len(root), most):  # as bincount copies what it counts to int64
+    for part in blocks_of(len(root), most):  # as bincount copies its input to int64
         weight += np.bincount(root[part], minlength=len(roots))
     groups = list(_neighbours(center[rest[roots]], weight, np.arange(len(roots)), most))
     group = np.empty(len(roots), np.int32)
@@ -309,7 +309,7 @@ def parts_of(
 
 
 def _largest(limit: FloatArray, most: int) -> NDArray[np.bool_]:
-    """Return a (N,) mask of the `most` largest; of equal ones the first, which are not below the others."""
+    """Return a (N,) mask of the `most` largest numbers; the first among equals, as parents come first."""
     least = np.partition(limit, len(limit) - most)[len(limit) - most]
     found: NDArray[np.bool_] = limit > least
     equal = np.flatnonzero(limit == least)
@@ -318,7 +318,7 @@ def _largest(limit: FloatArray, most: int) -> NDArray[np.bool_]:
 
 
 def _roots(parent: Index, members: Index) -> Index:
-    """Return the (N,) place, among ascending members, of the highest ancestor of each that is a member."""
+    """Return the (N,) places, among ascending members, of each member's highest ancestor that is a member."""
     above = _part(parent, members)
     root = np.where(above < 0, np.arange(len(above), dtype=np.int32), above)
     del above
@@ -331,7 +331,7 @@ def _roots(parent: Index, members: Index) -> Index:
 def _neighbours(
     center: FloatArray, weight: NDArray[np.int64], some: NDArray[np.int64], most: int
 ) -> Iterator[NDArray[np.int64]]:
-    """Yield subtrees in groups of at most `most` families, unless one has more; halved where they are spread most."""
+    """Divide subtrees into groups of at most `most` families, or one subtree, by halving along the longest side."""
     if len(some) == 1 or weight[some].sum() <= most:
         yield some
         return
@@ -344,7 +344,7 @@ def _neighbours(
 
 
 def families_of(tree: LodTree) -> tuple[NDArray[np.uint32], NDArray[np.int32]]:
-    """Return (F,) uint32 nodes with children, ascending, and (F,) int32 places of their parents, -1 for the root."""
+    """Return (F,) uint32 nodes with children, ascending, and (F,) int32 places of their parents among them, or -1."""
     nodes = np.flatnonzero(tree.child_count).astype(np.uint32)
     number = np.full(len(tree), -1, np.int32)
     number[nodes] = np.arange(len(nodes), dtype=np.int32)
@@ -353,10 +353,10 @@ def families_of(tree: LodTree) -> tuple[NDArray[np.uint32], NDArray[np.int32]]:
 
 
 def node_order(tree: LodTree, parents: NDArray[np.uint32]) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
-    """Return the order in which the root comes first, and then the families of (F,) `parents`.
+    """Return the order of nodes with the root first, then the children of (F,) `parents`.
 
     Returns:
-        (M,) uint32 the node at each place, and (M,) uint32 the `child_start` of each place.
+        (M,) uint32 node at each place, and (M,) uint32 its `child_start`.
     """
     total = len(tree)
     order, child_start = np.zeros(total, np.uint32), np.zeros(total, np.uint32)
@@ -374,7 +374,7 @@ def node_order(tree: LodTree, parents: NDArray[np.uint32]) -> tuple[NDArray[np.u
 def reordered(
     built: list[tuple[Splats, LodTree]], order: NDArray[np.uint32], child_start: NDArray[np.uint32]
 ) -> tuple[Splats, LodTree]:
-    """Return a tree in the order of `node_order`; `built` is emptied, so that columns are freed one by one."""
+    """Put a tree into an order of `node_order`. Empties `built`, so that columns are freed one by one."""
     nodes, tree = built.pop()
     columns = dict(vars(nodes))
     del nodes
@@ -384,11 +384,11 @@ def reordered(
 
 
 def _rows(column: FloatArray, order: NDArray[np.uint32]) -> FloatArray:
-    """`column[order]`, copied on the threads of kernels."""
+    """Return `column[order]`, copied on all threads."""
     found = np.empty((len(order), *column.shape[1:]), column.dtype)
 
     def copy(part: slice) -> None:
-        # "clip" lets numpy write to `found` at once; with its default it has a copy of its own.
+        # With "clip", numpy writes to `found` without a buffer.
         np.take(column, order[part], axis=0, out=found[part], mode="clip")
 
     for_blocks(copy, len(order), threads_in_use())
@@ -396,10 +396,10 @@ def _rows(column: FloatArray, order: NDArray[np.uint32]) -> FloatArray:
 
 
 def banded(built: list[tuple[Splats, LodTree]]) -> tuple[Splats, LodTree]:
-    """Return the same tree with its nodes in bands.
+    """Put the nodes of a tree into bands. Empties `built`, see `reordered`.
 
-    The root is node 0, siblings are consecutive, in the order that they had, and come after their parent. The result
-    does not depend on the number of threads. `built` is emptied, see `reordered`.
+    The root is node 0, siblings are consecutive, in their old order, and come after their parent. The result does not
+    depend on the number of threads.
     """
     nodes, tree = built[0]
     families, parent = families_of(tree)
@@ -409,18 +409,17 @@ def banded(built: list[tuple[Splats, LodTree]]) -> tuple[Splats, LodTree]:
 
 
 def band_order(parent: Index, count: NDArray[np.uint16], size: FloatArray) -> Index:
-    """Return the order of families of `banded`: (F,) int32 places, in the order in which the children are written.
+    """Return the order of the families of `banded`, as `family_order`.
 
     Args:
-        parent: (F,) for each node that has children, in the order of the nodes, the place here of its parent; -1 for
-            the root.
-        count, size: (F,) number of children and feature size of each.
+        parent: as of `family_order`, for nodes in the order of the tree.
+        count, size: (F,) number of children and feature size of each node.
     """
     if not len(parent):
         return np.empty(0, np.int32)
     depth, limit = find_limits(parent, np.fmax(size, np.float32(0)))
     levels = np.split(np.argsort(depth, kind="stable"), np.cumsum(np.bincount(depth))[:-1])
-    by_size = np.argsort(-limit, kind="stable")  # parents first, where they are as large
+    by_size = np.argsort(-limit, kind="stable")  # parents first among equals
     band = np.empty(len(parent), np.int32)
     before = np.cumsum(count[by_size], dtype=np.int64) - count[by_size]
     ends = [FIRST_BAND * BAND_GROWTH**k for k in range(max(1, math.ceil(math.log2(len(before)))) + 1)]
@@ -429,7 +428,7 @@ def band_order(parent: Index, count: NDArray[np.uint16], size: FloatArray) -> In
 
 
 def _depth_first(parent: Index, levels: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Return the (F,) place of each family where those below it follow it at once, in their order."""
+    """Return the (F,) place of each family in depth-first order."""
     below = np.ones(len(parent), np.int64)  # families of each subtree
     for level in levels[:0:-1]:
         np.add.at(below, parent[level], below[level])

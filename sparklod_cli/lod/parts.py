@@ -1,18 +1,17 @@
 """Detail levels of a tree, for Streamed SOG, and its tiles, for 3D Tiles.
 
-Detail levels are cuts of a tree that do not depend on a camera, region by region. Tiles are cuts that refine one
-another, divided in space. Both have plain splats.
+Detail levels are cuts of a tree for all cameras, divided into regions. Tiles are cuts of a tree, each a refinement of
+the one before, divided in space. Both have plain splats.
 
-Splats of an opacity above 1 become ones of opacity 1, for formats that hold no more. A splat of linear opacity A > 1
-has the alpha p(z) = 1 - (1 - exp(-z^2 / 2)) ** A, flat on top. A plain Gaussian of opacity 1 and k times the scale has
-g(z) = exp(-z^2 / (2 k^2)). Both are isotropic on the screen, in standard deviations of the splat, so k depends on A
-alone. It is the one that covers as much: the integral of p over the plane is 2 pi H(A), with the harmonic number H (see
-`model/falloff.py`), that of g is 2 pi k^2, so k = sqrt(H(A)).
+These formats hold opacities of at most 1: splats with more become larger ones of opacity 1. A splat of linear opacity
+A > 1 has the alpha p(z) = 1 - (1 - exp(-z^2 / 2)) ** A, flat on top. A plain Gaussian of opacity 1 and k times the
+scale has g(z) = exp(-z^2 / (2 k^2)). Both are isotropic on the screen, in standard deviations of the splat, so k
+depends on A alone. They cover the same area if k = sqrt(H(A)): the integral of p over the plane is 2 pi H(A), with the
+harmonic number H (see `model/falloff.py`), that of g is 2 pi k^2.
 
-The geometric error of a tile is `PIXEL_ERROR` times the median feature size of those of its splats that its children
-replace. A viewer such as CesiumJS refines a tile where its error, projected, is larger than 16 pixels by default: where
-half of these splats are larger than a pixel. That is the rule by which Spark refines a node (see `traversal`), for a
-tile as a whole. See docs/decisions/21-3d-tiles.md.
+The geometric error of a tile is `PIXEL_ERROR` times the median feature size of the splats that its children replace. A
+viewer such as CesiumJS refines a tile if its projected error is larger than 16 pixels by default, so if half of these
+splats are larger than a pixel: Spark's rule for a node, applied to a whole tile. See docs/decisions/21-3d-tiles.md.
 """
 
 from __future__ import annotations
@@ -33,37 +32,36 @@ from ..system.progress import Progress, silent
 from .kernels.tree_links import find_parents
 from .tree_settings import DetailSettings, TileSettings
 
-#: Half a bound's side for one splat, in standard deviations. Tools bound a splat by the box of one standard deviation
-#: along its own axes, rotated; no multiple of the ellipsoid's box below sqrt(3) encloses that box however it is turned.
-#: There 22 % of the splat's opacity are left. More would move viewers, which take their distance from the bound, into
-#: the bounds of wide splats.
+#: Half the side of a splat's bound, in standard deviations. Other tools bound a splat by the rotated box of one
+#: standard deviation along its own axes; sqrt(3) is the least multiple of the ellipsoid's box that encloses that box at
+#: any rotation. At its border, 22 % of the splat's opacity are left. With more, viewers, which measure distances from
+#: bounds, would be inside the bounds of wide splats.
 EXTENT = 3**0.5
 
-#: Without given shares, each level has this share of the splats of the level before. A viewer goes one level coarser
-#: with each factor of its own in distance, by default 3 in PlayCanvas's engine: a surface then covers a ninth of the
-#: pixels, so that levels of a quarter still have twice as many splats a pixel as the one before. All coarser levels
-#: together are a third of full detail. Chosen.
+#: Share of each default level in the splats of the level before. A viewer draws a level coarser for each factor in
+#: distance, by default 3 in PlayCanvas's engine: a surface then covers a ninth of the pixels, so that levels of a
+#: quarter still have twice as many splats a pixel as the level before. All coarser levels together are a third of full
+#: detail. Chosen.
 STEP = 0.25
 
-#: Without given shares, levels are added until one has no more splats than this: what a viewer loads first, and draws
-#: at least. Chosen.
+#: Maximum number of splats of the coarsest default level, which a viewer loads first and draws at least. Chosen.
 COARSE_ENOUGH = 1 << 16
 
 #: Rows and columns, among xx xy xz yy yz zz, of the covariance on the planes xy, xz and yz, and the axes of these.
 PLANES = ((0, 3, 1, 0, 1), (0, 5, 2, 0, 2), (3, 5, 4, 1, 2))
 
-#: How far apart in the list of a node's children two may be for their overlap to count: all children of a tree of the
+#: Maximum distance of two siblings in the list of children for their overlap to count: all siblings in trees of the
 #: quality builder with up to 1.4 nodes a leaf. Nodes of other trees may have thousands. Chosen.
 SIBLINGS = 15
 
-#: Weight of opacity beside each of red, green and blue, as pictures may have any background. Chosen.
+#: Weight of opacity, where red, green and blue have 1: pictures may have any background. Chosen.
 ALPHA_WEIGHT = 1.0
 
-#: Standard deviation of the logarithms of the leaves' sizes from which on their number counts in full. Those of trained
-#: scenes differ by 0.6 and more. Chosen.
+#: Least standard deviation of ln(size) of the leaves for their number to count in full; trained scenes have 0.6 and
+#: more. Chosen.
 SIZES_DIFFER = 0.3
 
-#: Splats or pairs processed at a time, so that their columns stay in the cache. Chosen.
+#: Splats or pairs per block, so that their columns stay in the cache. Chosen.
 BLOCK = 1 << 14
 
 Nodes = NDArray[np.int64]
@@ -77,8 +75,8 @@ def make_levels(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progr
     """Return the detail levels of a scene, from its tree.
 
     Level 0 has the leaves, bit for bit if their opacity is at most 1. Each further level is a cut of the tree that the
-    finer levels refine. A region is a set of nodes of the coarsest level, and all that is below them: at every level it
-    stands for the same leaves, and no leaf is in two regions. The result does not depend on the number of threads.
+    finer levels refine. A region has some nodes of the coarsest level and all nodes below them: at every level it
+    represents the same leaves, and no leaf is in two regions. The result does not depend on the number of threads.
     The scene has no errors yet; within a run, splats are in the order of the tree.
     """
     leaves = int(np.count_nonzero(tree.is_leaf))
@@ -103,13 +101,10 @@ def make_levels(nodes: Splats, tree: LodTree, settings: DetailSettings, *, progr
 
 
 def owners_of(parent: NDArray[np.int32], cut: Nodes) -> NDArray[np.int64]:
-    """Return the (M,) place in a cut of each node or its ancestor there, from (M,) parents; -1 above the cut."""
+    """Return (M,) the place in a cut of each node or its ancestor in the cut, by (M,) parents; -1 above the cut."""
     above = np.maximum(parent, 0).astype(np.int64)
     above[cut] = cut
-    while True:  # each round doubles the number of edges that are gone up
-        higher = above[above]
-        if np.array_equal(higher, above):
-            break
+    while not np.array_equal(higher := above[above], above):  # each round doubles the number of edges climbed
         above = higher
     place = np.full(len(parent), -1, np.int64)
     place[cut] = np.arange(len(cut))
@@ -118,7 +113,7 @@ def owners_of(parent: NDArray[np.int32], cut: Nodes) -> NDArray[np.int64]:
 
 
 def shares_of(levels: Sequence[float] | None, leaves: int) -> list[float]:
-    """Return the shares of the levels after full detail: the given ones, or defaults for a number of leaves."""
+    """Return the shares of the levels after full detail; those of None suit the number of leaves."""
     if levels is not None:
         return list(levels)
     shares = [STEP]
@@ -128,9 +123,10 @@ def shares_of(levels: Sequence[float] | None, leaves: int) -> list[float]:
 
 
 class RefinementOrder:
-    """The order of losses in which nodes are refined, one for all cuts, so that each refines the coarser ones.
+    """The order in which nodes are refined, by descending `losses`.
 
-    Losses (see `losses`) do not grow from a node to its children, which are refined after it.
+    It is one for all cuts, so that each refines the coarser cuts. A node comes before its children, whose losses are no
+    larger.
 
     Attributes:
         parent: (M,) int32 parent of each node, -1 of the root.
@@ -142,23 +138,23 @@ class RefinementOrder:
         loss = losses(nodes, tree, self.parent)
         inner = np.flatnonzero(~tree.is_leaf)
         order = inner[np.argsort(-loss[inner], kind="stable")]  # parents come first among equals, too
-        self._turn = np.full(len(tree), len(order), np.int64)  # the number of nodes refined before it, leaves after all
+        self._turn = np.full(len(tree), len(order), np.int64)  # refined nodes before it; leaves come last
         self._turn[order] = np.arange(len(order))
         self._turn_of_parent = np.where(self.parent >= 0, self._turn[np.maximum(self.parent, 0)], -1)
         self._splats = 1 + np.cumsum(tree.child_count[order].astype(np.int64) - 1)
         self.leaves = len(tree) - len(inner)
 
     def cut(self, count: int) -> Nodes:
-        """Return the nodes, ascending, of the finest cut of at most `count` splats.
+        """Return the nodes, ascending, of the finest cut of at most `count` splats, but at least the root.
 
-        It has fewer by less than the children of a node; the root alone where `count` is less.
+        The cut is short of `count` by less than the children of a node.
         """
         refined = int(np.searchsorted(self._splats, count, side="right"))
         return np.flatnonzero((self._turn_of_parent < refined) & (self._turn >= refined))
 
 
 def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> tuple[list[Nodes], NDArray[np.int32]]:
-    """Return cuts of a tree with shares of its leaves, rounded, never more and less by at most the children of a node.
+    """Return the leaves and cuts with shares of their number, each as `RefinementOrder.cut`.
 
     Returns:
         (n,) ascending nodes of each level, the leaves first; and (M,) int32 parent of each node, -1 of the root.
@@ -168,22 +164,22 @@ def detail_cuts(nodes: Splats, tree: LodTree, shares: Sequence[float]) -> tuple[
     return [np.flatnonzero(tree.is_leaf), *cuts], order.parent
 
 
-@np.errstate(over="ignore", invalid="ignore")  # where splats are as large as float32 allows
+@np.errstate(over="ignore", invalid="ignore")  # of splats as large as float32 allows
 def losses(nodes: Splats, tree: LodTree, parent: NDArray[np.int32]) -> Column:
-    """Return the (M,) float64 loss of each node drawn instead of its subtree, not less than the losses in that.
+    """Return the (M,) float64 loss from drawing each node instead of its subtree; at least the losses in the subtree.
 
     The loss of a node is the root of its picture error, times its feature size, times its leaves (to a power of at most
     1). The picture error is the squared difference between the picture of the node and that of its children, over red,
     green, blue and opacity, on the planes of the three axes; like the size squared, an area. The number of leaves
-    measures detail: training puts small splats close together where pictures need them. Where all leaves have one size,
-    as in a point cloud, it measures only the density of samples: the power is 0.
+    measures detail: training puts small splats close together where pictures need them. If all leaves have one size, as
+    in a point cloud, it measures only the density of samples: the power is 0.
     """
     size = spark_size(nodes).astype(np.float64)
     loss = np.sqrt(picture_errors(with_plain_opacity(nodes), parent)) * size
     logs = np.log(np.maximum(size[tree.is_leaf], np.finfo(np.float64).tiny))
     power = min(1.0, float(logs.std()) / SIZES_DIFFER)
     leaves = tree.is_leaf.astype(np.float64)
-    for family, starts, members in _families(tree):
+    for family, members, starts in _families(tree):
         leaves[family] = np.add.reduceat(leaves[members], starts)
         own = np.nan_to_num(loss[family], nan=0.0) * leaves[family] ** power
         loss[family] = np.maximum(own, np.maximum.reduceat(loss[members], starts))
@@ -193,9 +189,8 @@ def losses(nodes: Splats, tree: LodTree, parent: NDArray[np.int32]) -> Column:
 def picture_errors(splats: Splats, parent: NDArray[np.int32]) -> Column:
     """Return the (M,) squared difference between the picture of each splat and the sum of its children's, 0 for leaves.
 
-    With Gaussians G of opacity times colour, it is the integral of (G - sum of G_c)^2 over each of three planes; the
-    mean of them, divided by pi. Children more than SIBLINGS apart are taken for ones that do not overlap.
-    Opacities are at most 1, and siblings are consecutive.
+    For Gaussians G of opacity times colour: the integral of (G - sum of G_c)^2 over a plane, the mean of three planes,
+    divided by pi. Overlaps of children more than SIBLINGS apart are left out. Opacities must be at most 1.
     """
     count = len(splats)
     shape = np.empty((count, 6))
@@ -216,9 +211,9 @@ def picture_errors(splats: Splats, parent: NDArray[np.int32]) -> Column:
     return np.where(inner, np.maximum(error + alone, 0), 0.0)
 
 
-@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # where splats have no extent, or are too far apart
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # of splats without extent, or too far apart
 def _shared(splats: Splats, shape: Column, first: NDArray[np.int64], second: NDArray[np.int64]) -> Column:
-    """Return (n,) integrals of products of two splats' pictures, in all channels; mean of the planes over pi."""
+    """Return (n,) integrals of the product of two splats' pictures, over all channels; mean of the planes, over pi."""
     found = np.empty(len(first))
     for begin in range(0, len(first), BLOCK):
         a, b = first[begin : begin + BLOCK], second[begin : begin + BLOCK]
@@ -239,7 +234,7 @@ def _shared(splats: Splats, shape: Column, first: NDArray[np.int64], second: NDA
 
 
 def _families(tree: LodTree) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]]:
-    """Return inner nodes by depth, the deepest first, where the children of each begin in a list, and the list."""
+    """Return, for each depth from the deepest: its inner nodes, all their children, and where those of each begin."""
     depth = tree.depths()
     inner = np.flatnonzero(~tree.is_leaf)
     inner = inner[np.argsort(depth[inner], kind="stable")]
@@ -249,12 +244,12 @@ def _families(tree: LodTree) -> list[tuple[NDArray[np.int64], NDArray[np.int64],
         starts = np.cumsum(count) - count
         first = tree.child_start[family].astype(np.int64)
         if len(family):
-            found.append((family, starts, np.repeat(first - starts, count) + np.arange(count.sum())))
+            found.append((family, np.repeat(first - starts, count) + np.arange(count.sum()), starts))
     return found
 
 
 def with_plain_opacity(splats: Splats) -> Splats:
-    """Return splats with opacities of at most 1, those above enlarged so that they cover as much on the screen."""
+    """Limit opacities to 1, and enlarge the splats with more so that they cover as much of the screen as before."""
     above = np.flatnonzero(splats.opacity > 1)
     if not above.size:
         return splats
@@ -269,16 +264,16 @@ def with_plain_opacity(splats: Splats) -> Splats:
 def divide(
     center: FloatArray, box: Boxes, splats: NDArray[np.int64], settings: DetailSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Divide nodes of the coarsest level at the median of their splats along the longest side, until they are few.
+    """Divide nodes of the coarsest level into regions, recursively at the median splat along the longest side.
 
     Args:
         center: (n, 3) of the nodes, world units.
         box: (n, 2, 3) corners of all centres under each node, at any level.
-        splats: (n,) int64 splats under each, of all levels.
-        settings: sizes of regions; a region that is a single node is not divided.
+        splats: (n,) int64 splats under each node, of all levels.
+        settings: sizes of regions; a single node is not divided, whatever its size.
 
     Returns:
-        (n,) int64 region of each node, and (R - 1, 2) int64 children as of `DetailScene`.
+        (n,) int64 region of each node, and (R - 1, 2) int64 `DetailScene.children`.
     """
     number = np.zeros(len(splats), np.int64)
     children: list[list[int]] = []
@@ -293,28 +288,25 @@ def divide(
             number[some] = regions
             own, regions = -1 - regions, regions + 1
         else:
-            first, second = _halves(some, center[some], count)
+            ordered = some[_along_longest_side(center[some])]
+            until = np.cumsum(splats[ordered])
+            cut = 1 + int(np.argmin(np.abs(2 * until[:-1] - until[-1])))
             own = len(children)
             children.append([])
-            waiting += [(second, own), (first, own)]  # the first is taken next
+            waiting += [(ordered[cut:], own), (ordered[:cut], own)]  # the first half comes next
         if parent >= 0:
             children[parent].append(own)
     return number, np.array(children, np.int64).reshape(-1, 2)
 
 
-def _halves(
-    some: NDArray[np.int64], center: FloatArray, splats: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the parts of two or more nodes, with as many splats each as the nodes allow."""
+def _along_longest_side(center: FloatArray) -> NDArray[np.int64]:
+    """Return the order of centres along the longest side of their box."""
     axis = int(np.argmax(np.ptp(center.astype(np.float64), axis=0)))
-    order = np.argsort(center[:, axis], kind="stable")
-    until = np.cumsum(splats[order])
-    cut = 1 + int(np.argmin(np.abs(2 * until[:-1] - until[-1])))
-    return some[order[:cut]], some[order[cut:]]
+    return np.argsort(center[:, axis], kind="stable")
 
 
 def extents(splats: Splats) -> Boxes:
-    """Return (N, 2, 3) corners of splats' boxes, EXTENT standard deviations of the ellipsoids on either side."""
+    """Return (N, 2, 3) corners of the boxes of splats, EXTENT standard deviations on either side."""
     boxes = np.empty((len(splats), 2, 3))
     for begin in range(0, len(splats), BLOCK):
         some = slice(begin, begin + BLOCK)
@@ -326,25 +318,22 @@ def extents(splats: Splats) -> Boxes:
 
 
 def united(boxes: FloatArray, number: NDArray[np.int64], count: int) -> Boxes:
-    """Return (count, 2, 3) boxes around all boxes of each number, each of which occurs."""
+    """Return (count, 2, 3) boxes, each around all boxes of its number; each number must occur."""
     order = np.argsort(number, kind="stable")
     starts = np.searchsorted(number[order], np.arange(count))
     low = np.minimum.reduceat(boxes[order, 0], starts)
     return np.stack([low, np.maximum.reduceat(boxes[order, 1], starts)], axis=1).astype(np.float64)
 
 
-def middle_of(splats: Splats) -> NDArray[np.float64]:
-    """Return the (3,) median of one or more centres along each axis, which few splats far outside do not move."""
-    return np.asarray(np.median(splats.center.astype(np.float64), axis=0))
-
-
 def beyond(splats: Splats, radius: float) -> NDArray[np.bool_]:
     """Return a (N,) mask of the splats whose centres are farther than a radius from the middle of the scene.
+
+    The middle is the median of the centres along each axis, which few splats far outside hardly move.
 
     Raises:
         InvalidSplatsError: all splats are farther.
     """
-    middle = middle_of(splats)
+    middle = np.median(splats.center.astype(np.float64), axis=0)
     offset = splats.center - middle
     far: NDArray[np.bool_] = np.einsum("ij,ij->i", offset, offset) > float(radius) ** 2
     if far.all():
@@ -356,12 +345,12 @@ def beyond(splats: Splats, radius: float) -> NDArray[np.bool_]:
     return far
 
 
-#: Geometric error of a splat in its feature sizes: pixels of error that CesiumJS allows by default
-#: (`maximumScreenSpaceError`), so that a splat is refined where it is larger than a pixel.
+#: Geometric error of a splat, in its feature sizes: as many as CesiumJS allows pixels of error by default
+#: (`maximumScreenSpaceError`), so that splats larger than a pixel are refined.
 PIXEL_ERROR = 16.0
 
-#: Least geometric error of a tile that has children, as a share of the diagonal of its box: one of 0 is never refined.
-#: A millionth of what fills a screen is no pixel of any. Chosen.
+#: Least geometric error of a tile that has children, as a share of the diagonal of its box: a tile of error 0 is never
+#: refined. A millionth is less than a pixel if the tile fills the screen. Chosen.
 LEAST_ERROR = 1e-6
 
 
@@ -369,8 +358,8 @@ def make_tiles(nodes: Splats, tree: LodTree, settings: TileSettings, *, progress
     """Return the tiles of a scene, from its tree.
 
     Tiles without children have the leaves, bit for bit if their opacity is at most 1. Every level is a cut of the tree
-    of about a quarter of the splats of the next finer one, up to the root tile, whose cut is one tile. The children of
-    a tile have the nodes of a finer cut that are below those of the tile, or are those: no splat is lost or doubled.
+    with about a quarter of the splats of the next finer one, up to the root tile, whose cut is one tile. The children
+    of a tile have the nodes of the next cut at or below the nodes of the tile: no splat is lost or doubled.
     The result does not depend on the number of threads.
     Tiles are in the order of their levels; within a tile, splats are in the order of the tree.
     """
@@ -378,7 +367,7 @@ def make_tiles(nodes: Splats, tree: LodTree, settings: TileSettings, *, progress
     cuts = tile_cuts(order, settings.tile_splats)
     members: list[Nodes] = [cuts[0]]
     parent, level = [-1], [0]
-    tile = np.full(len(nodes), -1, np.int64)  # of the nodes of the cut that was last divided
+    tile = np.full(len(nodes), -1, np.int64)  # of the nodes of the cut divided last
     tile[cuts[0]] = 0
     for number in range(1, len(cuts)):
         progress("dividing", number, len(cuts), "level")
@@ -401,7 +390,7 @@ def make_tiles(nodes: Splats, tree: LodTree, settings: TileSettings, *, progress
 
 
 def tile_cuts(order: RefinementOrder, tile_splats: int) -> list[Nodes]:
-    """Return cuts, the coarsest, of at most `tile_splats`, first; each has `STEP` of the splats of the next one."""
+    """Return cuts from coarse to fine, the first of at most `tile_splats`, each `STEP` times the next one."""
     counts = [order.leaves]
     while counts[-1] > tile_splats:
         counts.append(round(counts[-1] * STEP))
@@ -409,15 +398,12 @@ def tile_cuts(order: RefinementOrder, tile_splats: int) -> list[Nodes]:
 
 
 def _groups(some: Nodes, center: FloatArray, count: int) -> list[Nodes]:
-    """Divide nodes into `count` ascending groups of about one size, recursively along the longest side."""
+    """Divide nodes into `count` sorted groups of about the same size, recursively along the longest side."""
     if count < 2:
         return [np.sort(some)]
-    where = center[some]
-    axis = int(np.argmax(np.ptp(where.astype(np.float64), axis=0)))
-    order = np.argsort(where[:, axis], kind="stable")
-    first = count // 2
+    ordered, first = some[_along_longest_side(center[some])], count // 2
     at = len(some) * first // count
-    return _groups(some[order[:at]], center, first) + _groups(some[order[at:]], center, count - first)
+    return _groups(ordered[:at], center, first) + _groups(ordered[at:], center, count - first)
 
 
 def _measured(
@@ -428,7 +414,7 @@ def _measured(
     level: NDArray[np.int32],
     settings: TileSettings,
 ) -> TileScene:
-    """Return tiles with their splats, bounds and errors."""
+    """Return the scene of tiles with these nodes, with bounds and errors."""
     counts = np.array([len(each) for each in members], np.int64)
     index, number = np.concatenate(members), np.repeat(np.arange(len(members)), counts)
     splats = with_plain_opacity(nodes.take(index))

@@ -20,16 +20,16 @@ MIN_BASE, MAX_BASE, DEFAULT_BASE = 1.1, 2.0, 1.5
 #: Maximum ratio of nodes to leaves in the quality builder; 2 keeps every node of its binary tree.
 MIN_GROWTH, MAX_GROWTH, DEFAULT_GROWTH = 1.05, 2.0, 1.4
 
-#: Growth of the tree that the detail levels of a Streamed SOG are cut from: as it is not written, it keeps all nodes.
+#: Growth of the tree from which the detail levels of a Streamed SOG are cut: all nodes, as it is not written itself.
 DETAIL_GROWTH = MAX_GROWTH
 
-#: Bytes of a splat at the peak of a bake, without spherical harmonics and for each of their coefficients: peaks of
-#: processes (VmHWM), as `benchmarks/bench_memory.py` measures them, with some reserve.
+#: Bytes of a splat at the peak of a bake: without spherical harmonics, and for each coefficient of them. Measured by
+#: `benchmarks/bench_memory.py` (VmHWM), with some reserve.
 SplatBytes = tuple[int, int]
 
 
 def bytes_of(each: SplatBytes, splats: int, sh_degree: int) -> int:
-    """Return the bytes of `splats` splats of an SH degree."""
+    """Return the bytes of splats of an SH degree."""
     fixed, coefficient = each
     return splats * (fixed + coefficient * COEFFICIENTS[sh_degree])
 
@@ -38,17 +38,17 @@ def bytes_of(each: SplatBytes, splats: int, sh_degree: int) -> int:
 class Builder:
     """A tree builder.
 
-    Its module has `build(splats, SETTING, *, progress) -> (nodes, tree)` and is a `stages.StagedBuilder`.
+    Its module has `build(splats, SETTING, *, progress) -> (nodes, tree)`; the module of the same name with `_stages`
+    is a `stages.StagedBuilder`.
 
     Attributes:
         setting: name of its only parameter, a number.
         summary: phrase for help texts.
-        in_bands: its trees are put in the order of `band_order` for files that are read whole. That saves 3 to 4 % of
-            a file of quality, and 1 to 2 % of one of quick, which is not worth the time.
-        in_memory: bytes of a splat of the input in a bake in memory.
+        in_bands: put the nodes into the order of `band_order` for files that are read whole. This saves 3 to 4 % of a
+            file of quality, but only 1 to 2 % of a file of quick, which is not worth the time.
+        in_memory: bytes of an input splat in a bake in memory.
         in_block: bytes of a splat of a block out of core.
-        in_scratch: bytes of a splat of the input in the scratch folder out of core, where splats of a block are removed
-            when its nodes are made.
+        in_scratch: bytes of an input splat in the scratch folder out of core; splats of a finished block are removed.
     """
 
     setting: str
@@ -59,7 +59,7 @@ class Builder:
     in_scratch: SplatBytes
 
 
-#: Builders by the name of the method, which is that of the module; the first is the default.
+#: Builders by the name of the method and of the module; the first is the default.
 BUILDERS = {
     "quick": Builder(
         "base",
@@ -81,19 +81,15 @@ BUILDERS = {
 METHODS = tuple(BUILDERS)
 
 
-#: The most levels after full detail. Viewers choose between a handful; chosen.
+#: Maximum number of levels after full detail. Chosen: viewers use a handful.
 MOST_LEVELS = 15
 
-#: Least determinant of the axes of a transform, as a share of the product of their lengths: less is flat. Chosen.
+#: Least determinant of the axes of a transform, as a share of the product of their lengths; below, it is flat. Chosen.
 LEAST_VOLUME = 1e-6
 
 
 def parse_levels(text: str) -> tuple[float, ...] | None:
-    """Return the levels of a text such as "50%,25%,12%", as shares of full detail; None for "auto".
-
-    Raises:
-        ValueError: the text is neither.
-    """
+    """Parse levels such as "50%,25%,12%" into shares of full detail; "auto" into None. Raises `ValueError`."""
     if text.strip() == "auto":
         return None
     from .budget import SHARE  # whose fractions take milliseconds to load
@@ -109,15 +105,16 @@ def parse_levels(text: str) -> tuple[float, ...] | None:
 
 
 def _are_levels(levels: tuple[float, ...]) -> bool:
+    """Return whether the number of levels and their shares are valid."""
     descends = all(a > b for a, b in itertools.pairwise((1.0, *levels, 0.0)))
     return 0 < len(levels) <= MOST_LEVELS and descends
 
 
 @dataclass(frozen=True)
 class DetailSettings(CheckedSettings):
-    """Settings of regions and detail levels; the defaults are those of the tools of the makers of Streamed SOG.
+    """Settings of regions and detail levels; the defaults are those of PlayCanvas's own tools.
 
-    A region has no more splats of all levels together than a chunk file.
+    A region has, over all levels, at most as many splats as a chunk file.
     """
 
     HEADING: ClassVar[str] = "Streamed SOG"
@@ -152,14 +149,9 @@ class DetailSettings(CheckedSettings):
 
 
 def parse_matrix(text: str) -> tuple[float, ...]:
-    """Return the numbers of a text such as "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1".
-
-    Raises:
-        ValueError: they are not 16 finite numbers of an affine transform that neither flattens nor mirrors.
-    """
-    parts = text.replace(",", " ").split()
+    """Parse a matrix such as "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1"; raise `ValueError` as `check_matrix`."""
     try:
-        matrix = tuple(map(float, parts))
+        matrix = tuple(map(float, text.replace(",", " ").split()))
     except ValueError:
         matrix = ()
     check_matrix(matrix, repr(text))
@@ -167,7 +159,7 @@ def parse_matrix(text: str) -> tuple[float, ...]:
 
 
 def check_matrix(matrix: tuple[float, ...], name: str) -> None:
-    """Raise `ValueError` where numbers are no affine transform, column by column, that keeps volumes and hands."""
+    """Raise `ValueError` unless numbers are an affine transform, column by column, not flattening and not mirroring."""
     if len(matrix) != 16 or not all(map(math.isfinite, matrix)):
         raise ValueError(f"{name} is not 16 finite numbers, a matrix of 4 rows column by column")
     (a, b, c, p), (d, e, f, q), (g, h, i, r), (*_, s) = (matrix[at : at + 4] for at in (0, 4, 8, 12))
@@ -219,7 +211,7 @@ class TileSettings(CheckedSettings):
     @property
     def matrix(self) -> tuple[float, ...]:
         """Transform of the root tile, column by column."""
-        from ..model.transforms import IDENTITY, earth_matrix  # what outputs of other formats do without
+        from ..model.transforms import IDENTITY, earth_matrix  # not needed for other outputs
 
         if self.lat is None or self.lon is None:
             return self.transform or IDENTITY

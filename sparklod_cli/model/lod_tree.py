@@ -13,7 +13,7 @@ from ..system.errors import TreeError
 #: The most children of a node: child counts are uint16 in Spark's nodes and in SPZ files.
 MAX_CHILDREN = 65535
 
-#: Attribute of a tree of `frozen`: whether it was validated.
+#: Attribute of frozen trees: whether the tree was validated.
 _VALID = "_valid"
 
 
@@ -23,7 +23,7 @@ class LodTree:
 
     Attributes:
         child_count: (M,) uint16, 0 for a leaf.
-        child_start: (M,) uint32 index of the first child; of a leaf it means nothing, and writers leave it 0.
+        child_start: (M,) uint32 index of the first child; without meaning for a leaf, where writers put 0.
     """
 
     child_count: NDArray[np.uint16]
@@ -43,23 +43,23 @@ class LodTree:
         return len(self.child_count)
 
     def frozen(self) -> LodTree:
-        """Return this tree with immutable columns, copied unless they are so already.
+        """Return this tree with immutable columns, copied unless it is frozen already.
 
         Kernels follow links without bounds checks: a tree must not change after `validate`.
         """
         if _VALID in self.__dict__:
             return self
-        # Of bytes, as the owner of a read-only array can make it writable again.
+        # From bytes, as the owner of a read-only array can make it writable again.
         count, start = self.child_count.tobytes(), self.child_start.tobytes()
         tree = LodTree(np.frombuffer(count, np.uint16), np.frombuffer(start, np.uint32))
         tree.__dict__[_VALID] = False
         return tree
 
     def __reduce__(self) -> tuple[type[LodTree], tuple[Any, ...]]:
-        return LodTree, (self.child_count, self.child_start)  # a copy can be written to, and is validated again
+        return LodTree, (self.child_count, self.child_start)  # copies are writable, and validated again
 
     def rows(self, part: slice) -> LodTree:
-        """Return views of some consecutive nodes."""
+        """Return views of consecutive nodes."""
         return LodTree(self.child_count[part], self.child_start[part])
 
     @property
@@ -72,11 +72,7 @@ class LodTree:
         return np.where(self.is_leaf, np.uint32(0), self.child_start)
 
     def depths(self) -> NDArray[np.int32]:
-        """Return (M,) int32 number of edges from the root to each node.
-
-        Raises:
-            TreeError: the tree is broken.
-        """
+        """Return (M,) int32 numbers of edges from the root to each node; raise `TreeError` if the tree is invalid."""
         self.validate()
         depth = np.zeros(len(self), np.int32)
         frontier = np.zeros(1, np.int64)
@@ -94,10 +90,10 @@ class LodTree:
         """Check that this is a single tree with root 0, in linear time.
 
         Each node but the root is the child of exactly one node, which comes before it. As in Spark, the
-        `child_start` of a leaf is not checked. A tree of `frozen` is validated once.
+        `child_start` of a leaf is not checked. A frozen tree is validated once.
 
         Raises:
-            TreeError: an invariant is violated; names the first node that violates it.
+            TreeError: the tree is invalid; names the first invalid node.
         """
         if self.__dict__.get(_VALID):
             return

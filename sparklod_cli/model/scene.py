@@ -2,8 +2,8 @@
 
 The axis that points up is known from a note of sparklod, from the coordinate system of an SPZ 4, or for the formats of
 `SPECIFIED` from their specification; outputs note it. All other formats, and trees in SPZ, have the axes of the files
-that they were made from: their axis is unknown and not noted, and cameras take `ASSUMED`. No coordinate is turned
-unless a user asks for it.
+that they were made from: the axis is unknown, outputs do not note it, and cameras assume `ASSUMED`. No coordinate is
+rotated unless a user asks for it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .sh import COEFFICIENTS
 from .splats import Splats, describe_invalid
 
 #: Coding of scales: "spz", or one of RAD's "ln_0r8" and "ln_f16"; empty for plain numbers, which all readers decode
-#: alike. Then the ends of the range of the logarithms, where the codes have one; else 0.
+#: alike. Then the ends of the range of the logarithms, or 0 for codings without a range.
 ScaleCoding = tuple[str, float, float]
 
 #: Codings of plain numbers and of SPZ.
@@ -37,8 +37,8 @@ class FileCoding:
     Attributes:
         scales: coding of each run of splats, in order.
         run: number of splats of each run but the last.
-        packed_range: ends of the range of logarithms in which Spark packs the scales of the file as PackedSplats, where
-            the file sets one (RAD's "splatEncoding"); None for Spark's own.
+        packed_range: ends of the range of ln(scale) that the file sets for Spark's PackedSplats (RAD's
+            "splatEncoding"); None for Spark's default.
     """
 
     scales: tuple[ScaleCoding, ...] = (PLAIN_SCALES,)
@@ -46,7 +46,7 @@ class FileCoding:
     packed_range: tuple[float, float] | None = None
 
     def parts(self, count: int) -> Iterator[tuple[slice, ScaleCoding]]:
-        """Return the rows of `count` splats, as few slices as their codings allow."""
+        """Yield the rows of `count` splats in runs of one coding, with the coding."""
         start = 0
         for number, coding in enumerate(self.scales):
             last = number + 1 == len(self.scales)
@@ -66,11 +66,11 @@ AXES: dict[str, tuple[float, float, float]] = {
     "-z": (0.0, 0.0, -1.0),
 }
 
-#: By format, the axis that points up by its specification. z is up in a tileset of 3D Tiles, and y in the glTF of its
-#: tiles, whose axes splats are read in. Files of SPZ without a tree; Spark's builder and sparklod's keep other axes.
+#: Up axis by the specification of a format. SPZ only without a tree, as builders keep other axes. A tileset of 3D Tiles
+#: has z up, but the glTF of its tiles, whose axes splats keep, has y up.
 SPECIFIED: Mapping[str, str] = {"SPZ": "y", "glTF": "y"}
 
-#: The axis that cameras take for up in scenes that do not say it: training leaves them with y down.
+#: Up axis that cameras assume for scenes that do not set it: trained scenes have y down.
 ASSUMED = "-y"
 
 
@@ -78,21 +78,21 @@ ASSUMED = "-y"
 class Scene:
     """Splats and the metadata of their file.
 
-    The columns of splats become read-only views, so that a scene cannot change after it was drawn. Arrays that were
-    passed in keep their flags; pictures drawn after a write to one of them are undefined. The columns of the tree, a
-    tenth of its bytes at most, are copied, so that a valid tree stays valid.
+    The columns of splats become read-only views, so that a drawn scene does not change. The arrays passed in keep their
+    flags; pictures drawn after a write to such an array are undefined. The columns of the tree, at most a tenth of the
+    bytes, are copied, so that a valid tree stays valid.
 
     Attributes:
         splats: N splats, in the order and the axes of the file.
-        tree: (N,) nodes where the file is a Level-of-Detail tree, else None.
+        tree: (N,) nodes of a Level-of-Detail tree; None for a scene without a tree.
         antialiased: trained with the opacity compensation of Mip-Splatting.
         format: name of the file format, for display ("PLY", "SPZ 4").
         notes: losses in reading the file, for display.
         header: further numbers of the file's header, by name ("version", "fractional_bits").
         chunk_bytes: bytes of each chunk in the file; None for formats without chunks.
         coding: coding of the scales in the file; None for float32.
-        up: the axis that points up, one of `AXES` ("y", "-z"); None where it is unknown.
-        up_by: the format that specifies this axis ("SPZ", "glTF"); empty if the file names it, or it is unknown.
+        up: the axis that points up, one of `AXES` ("y", "-z"); None if unknown.
+        up_by: the format that specifies this axis ("SPZ", "glTF"); empty if the file itself does, or it is unknown.
     """
 
     splats: Splats
@@ -114,11 +114,7 @@ class Scene:
             object.__setattr__(self, "tree", self.tree.frozen())
 
     def check_tree(self) -> None:
-        """Check that the tree, if there is one, is valid and has a node for each splat.
-
-        Raises:
-            TreeError: it is invalid.
-        """
+        """Check that the tree, if any, is valid and has a node for each splat; raise `TreeError` otherwise."""
         if self.tree is not None:
             if len(self.tree) != len(self.splats):
                 raise TreeError(f"the tree has {len(self.tree):,} nodes, but there are {len(self.splats):,} splats")
@@ -147,13 +143,11 @@ class Scene:
             rgb: (N, 3) display-referred colours, 0..1; SH_C0 * f_dc + 0.5 of a trained file.
             sh: (N, K, 3) higher SH coefficients, K = 0, 3, 8 or 15; None for none.
             antialiased: trained with the opacity compensation of Mip-Splatting.
-            up: the axis that points up, such as "y" or "-z"; None where it is unknown.
+            up: the axis that points up, such as "y" or "-z"; None if unknown.
 
         Raises:
-            ValueError: an array has another shape, or holds something else than real numbers; names it. There is no
-                such axis.
-            InvalidSplatsError: splats have numbers that no Gaussian has: NaN, a negative scale, a quaternion of another
-                length than 1.
+            ValueError: an array has another shape or other contents than real numbers, or there is no such axis.
+            InvalidSplatsError: splats are invalid: NaN, a negative scale, a quaternion of another length than 1.
         """
         count = len(np.atleast_1d(np.asarray(center)))
         shapes = {"center": (3,), "scale": (3,), "quat_xyzw": (4,), "opacity": (), "rgb": (3,)}
@@ -192,7 +186,7 @@ class Scene:
 
 
 def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-    """Return a column of `Splats` from numbers of this very shape."""
+    """Return a column of `Splats`; raise `ValueError` unless the values are real numbers of this shape."""
     array = np.asarray(values)
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{name} holds {array.dtype}; give real numbers")
@@ -203,20 +197,20 @@ def _column(name: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray[
 
 
 def facts_of(source: Any) -> dict[str, Any]:
-    """Return the metadata that scenes of all kinds have of their files, by the names of its attributes."""
+    """Return the attributes that all kinds of scenes have of their files."""
     return {name: getattr(source, name) for name in ("antialiased", "format", "notes", "header", "up", "up_by")}
 
 
 def up_note(up: str, up_by: str) -> str:
-    """Return the message on an axis that a specification names, which a file may contradict."""
+    """Return the message on an up axis set by a specification, which a file may contradict."""
     return f"{up} is up, as {up_by} specifies; if the scene is upside down, its converter kept y down: give --up -y"
 
 
 def up_notes_of(files: Iterable[tuple[str, str | None, str]]) -> list[str]:
-    """Return the messages on the axes of files that are shown together: that of each file, and one if they differ.
+    """Return the messages on the up axes of files in one view: one on each file, and one if the axes differ.
 
     Args:
-        files: the name of each, and `up` and `up_by` of its scene.
+        files: name, `Scene.up` and `Scene.up_by` of each file.
     """
     each = list(dict.fromkeys(files))
     messages = [f"{name}: {up_note(up, up_by)}" for name, up, up_by in each if up and up_by]
@@ -225,23 +219,23 @@ def up_notes_of(files: Iterable[tuple[str, str | None, str]]) -> list[str]:
 
 
 def differing(axes: Iterable[str | None]) -> str:
-    """Return the beginning of a sentence that names the different axes of files."""
+    """Return the beginning of a message on files with different up axes."""
     return f"the files differ in the axis that is up ({', '.join(dict.fromkeys(axis or 'unknown' for axis in axes))})"
 
 
 def rotated_axis(axis: str, rotation: ArrayLike) -> str:
-    """Return the axis, one of `AXES`, nearest to where a rotation takes an axis.
+    """Return the axis, one of `AXES`, nearest to a rotated axis.
 
-    The nearest one, since a rotation by a few degrees levels a scene whose axis was only roughly up.
+    A rotation by a few degrees levels a scene whose axis was only roughly up.
 
     Args:
-        rotation: (3, 3) matrix that multiplies column vectors; it may scale them, too.
+        rotation: (3, 3) matrix for column vectors, which may scale, too.
     """
     up = np.asarray(rotation, np.float64) @ AXES[axis]
     return max(AXES, key=lambda name: float(up @ AXES[name]))
 
 
 def common_axis(axes: Iterable[str | None]) -> str | None:
-    """Return the axis that all scenes have up; None where one is unknown or two differ."""
+    """Return the common up axis of scenes; None if an axis is unknown or two differ."""
     distinct = set(axes)
     return distinct.pop() if len(distinct) == 1 else None

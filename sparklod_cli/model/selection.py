@@ -1,4 +1,4 @@
-"""`Selection`, which splats of a scene to keep: it drops what cannot be drawn, crops, and counts what it drops."""
+"""`Selection`: drops splats that cannot be drawn or lie outside of a crop, and counts them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .splats import INVALID, Splats, describe_counts
 
 Vector = tuple[float, float, float]
 
-#: Reasons for dropping a splat, in the order in which they are applied, and their words in a report.
+#: Reasons for dropping a splat, in the order of their application, and their words in a report.
 REASONS = INVALID | {
     "zero_opacity": "zero opacity",
     "zero_scale": "zero scale",
@@ -21,13 +21,13 @@ REASONS = INVALID | {
     "cropped": "cropped",
 }
 
-#: Splats that a thread examines at a time: they and what is made of them stay in the processor's cache.
+#: Splats that a thread examines at a time: few enough for the processor's cache.
 EXAMINED = 1 << 15
 
 
 @dataclass(frozen=True)
 class SelectionTally:
-    """Counts of splats of a scene, or of a part of it, that a selection keeps and drops.
+    """Counts of the selected and dropped splats of a scene, or of a part of it.
 
     Attributes:
         count: N splats.
@@ -41,30 +41,28 @@ class SelectionTally:
 
     @property
     def selected(self) -> int:
-        """Number of splats that are kept."""
+        """Number of selected splats."""
         return self.count - sum(self.dropped.values())
 
     def then(self, after: SelectionTally) -> SelectionTally:
-        """Return the tally of these splats and those after them."""
+        """Return the tally of these splats followed by others."""
         first = self.first_invalid
         if first is None and after.first_invalid is not None:
             first = self.count + after.first_invalid
-        dropped = {reason: self.dropped.get(reason, 0) + after.dropped.get(reason, 0) for reason in REASONS}
-        return SelectionTally(
-            self.count + after.count, {reason: count for reason, count in dropped.items() if count}, first
-        )
+        sums = {reason: self.dropped.get(reason, 0) + after.dropped.get(reason, 0) for reason in REASONS}
+        return SelectionTally(self.count + after.count, {reason: sum_ for reason, sum_ in sums.items() if sum_}, first)
 
 
 @dataclass(frozen=True)
 class Selection:
-    """The splats to keep.
+    """Criteria of the splats to keep.
 
     Attributes:
         drop_invalid: drop invalid splats (`splats.INVALID`) instead of raising an error.
-        min_opacity: keep splats of at least this opacity, 0..1.
-        min_box, max_box: keep splats whose centre lies in this box, borders (as float32) included; world units.
-        within: keep splats whose centre lies in this ball: centre and radius, world units.
-        drop_invisible: drop splats without opacity or size, which are no part of a tree.
+        min_opacity: least opacity, 0..1.
+        min_box, max_box: lowest and highest centre, borders (as float32) included; world units.
+        within: ball around all centres: centre and radius, world units.
+        drop_invisible: drop splats without opacity or size, which trees cannot have.
     """
 
     drop_invalid: bool = False
@@ -75,7 +73,7 @@ class Selection:
     drop_invisible: bool = True
 
     def apply(self, splats: Splats, *, threads: int = 1) -> tuple[Splats, dict[str, int]]:
-        """Return the splats that are kept, in their order, and the number dropped for each of `REASONS` that occurred.
+        """Return the selected splats, in their order, and `SelectionTally.dropped`.
 
         Raises:
             InvalidSplatsError: there are no splats, some are invalid without `drop_invalid`, or none is left.
@@ -85,9 +83,9 @@ class Selection:
         return (splats if keep.all() else splats.take(keep)), tally.dropped
 
     def examine(self, splats: Splats, *, threads: int = 1) -> tuple[NDArray[np.bool_], SelectionTally]:
-        """Return the (N,) mask of the splats of a scene, or of a part of it, that are kept, and a tally of the others.
+        """Return the (N,) mask of the selected splats of a scene, or of a part of it, and the tally.
 
-        Invalid splats are never kept.
+        Invalid splats are never selected.
         """
         keep, tally = np.ones(len(splats), np.bool_), SelectionTally()
         parts = blocks_of(len(splats), EXAMINED)
@@ -98,29 +96,22 @@ class Selection:
 
     def _examine(self, splats: Splats) -> tuple[NDArray[np.bool_], SelectionTally]:
         invalid = splats.invalid()
-        visible = {
-            "zero_opacity": splats.opacity > 0,
-            "zero_scale": np.maximum.reduce(splats.scale.T, initial=0) > 0,
-        }
-        keeps = (
-            {kind: ~mask for kind, mask in invalid.items()}
-            | (visible if self.drop_invisible else {})
-            | {
-                "low_opacity": splats.opacity >= self.min_opacity,
-                "cropped": self._inside(splats.center),
-            }
-        )
-        keep = np.ones(len(splats), np.bool_)
-        dropped = {}
-        for reason in (reason for reason in REASONS if reason in keeps):
-            before = int(np.count_nonzero(keep))
-            keep &= keeps[reason]
-            dropped[reason] = before - int(np.count_nonzero(keep))
+        passes = {kind: ~mask for kind, mask in invalid.items()}
+        if self.drop_invisible:
+            passes["zero_opacity"] = splats.opacity > 0
+            passes["zero_scale"] = np.maximum.reduce(splats.scale.T, initial=0) > 0
+        passes["low_opacity"] = splats.opacity >= self.min_opacity
+        passes["cropped"] = self._inside(splats.center)
+        keep, dropped = np.ones(len(splats), np.bool_), {}
+        for reason, mask in passes.items():
+            if count := int(np.count_nonzero(keep & ~mask)):
+                dropped[reason] = count
+                keep &= mask
         first = min((int(np.argmax(mask)) for mask in invalid.values()), default=None)
-        return keep, SelectionTally(len(splats), {reason: count for reason, count in dropped.items() if count}, first)
+        return keep, SelectionTally(len(splats), dropped, first)
 
     def check(self, tally: SelectionTally) -> None:
-        """Check the tally of a whole scene: raise `InvalidSplatsError` if no tree can be built, see `apply`."""
+        """Check the tally of a whole scene; raises `InvalidSplatsError` as `apply`."""
         if tally.count == 0:
             raise InvalidSplatsError("it has no splats")
         if tally.first_invalid is not None and not self.drop_invalid:
@@ -149,5 +140,5 @@ class Selection:
 
 
 def describe(dropped: dict[str, int]) -> str:
-    """Return the dropped splats for display, such as "12 not finite, 3 cropped"."""
+    """Describe numbers of dropped splats, such as "12 not finite, 3 cropped"."""
     return ", ".join(f"{count:,} {REASONS[reason]}" for reason, count in dropped.items())

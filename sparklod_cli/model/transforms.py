@@ -1,19 +1,19 @@
-"""Turn, scale and move splats, with all that they consist of: centres, axes, sizes and spherical harmonics.
+"""Rotation, scaling and translation of splats, with their axes, sizes and spherical harmonics; places on the Earth.
 
 Conventions:
     A point p becomes scale * rotation @ p + translation: rotated first, then scaled, then moved, about the origin of
     the file; three.js (`Object3D.matrix`) and splat-transform (its TRS matrix) have the same order. Rotations are
     active and right-handed: a positive angle turns counterclockwise, seen from the tip of the axis.
 
-    Euler angles are degrees about the axes x, y, z of the file, which stay where they are: first about x, then y, then
-    z, so that rotation = Rz @ Ry @ Rx. That is `Quat.setFromEulerAngles` of PlayCanvas, and so splat-transform's
-    `--rotate x,y,z`, and three.js's Euler order "ZYX" (not its default, "XYZ"). Coordinates here are those of the file.
-    Since its version 2, splat-transform's are those of an engine that turns PLY files by 180 degrees about z when it
-    loads them: for the same effect on a file, change the signs of its angles about x and y and of its moves along them.
+    Euler angles are degrees about the fixed axes x, y, z of the file: first about x, then y, then z, so that
+    rotation = Rz @ Ry @ Rx, as in `Quat.setFromEulerAngles` of PlayCanvas, so in splat-transform's `--rotate x,y,z`,
+    and in three.js's Euler order "ZYX" (not its default, "XYZ"). Coordinates here are those of the file. Those of
+    splat-transform since its version 2 are those of an engine that turns PLY files by 180 degrees about z on loading:
+    for the same effect on a file, change the signs of its angles about x and y and of its translations along them.
 
-    `up` names the axis of the file that points up; it becomes +y, as in three.js, by a turn about x, so that right
-    stays right. "-y" is half a turn: from the axes in which training leaves scenes (y down, z forward) to those of
-    three.js (y up, z back). "z" is a quarter turn, as from Blender to glTF: +y, forward there, becomes -z.
+    `up` names the axis of the file that points up; it becomes +y, as in three.js, by a rotation about x, so that right
+    stays right. "-y" is half a turn: from the axes of trained scenes (y down, z forward) to those of three.js (y up, z
+    back). "z" is a quarter turn, as from Blender to glTF: +y, forward there, becomes -z.
 
 Places on the Earth: the ellipsoid is that of WGS 84. The Earth's axes (ECEF) have their origin at its centre, x towards
 latitude 0 and longitude 0, z towards the north pole. Formulas: B. Hofmann-Wellenhof et al., GNSS, 2008, section 8.
@@ -37,23 +37,23 @@ from .splats import FloatArray, Splats
 
 Matrix = NDArray[np.float64]
 
-#: How far R^T R may be from the identity: float32 leaves 1e-7 of rotation matrices.
+#: Largest difference of R^T R from the identity; that of rotation matrices in float32 is 1e-7.
 SKEW = 1e-6
 
-#: No scale or translation is larger, and no scale smaller than the inverse: their squares must fit into a float32.
+#: Largest scale and translation, and the inverse of the smallest scale: their squares must fit into a float32.
 LARGEST = 1e12
 
-#: Numbers of an SH rotation this near to 0, 1 or -1 are those, so that half turns round nothing; least squares leave
-#: some 1e-15.
+#: Numbers of an SH rotation this near to 0, 1 or -1 are replaced by these, so that half turns round nothing; the errors
+#: of least squares are some 1e-15.
 SNAP = 1e-12
 
-#: Directions that SH are sampled in to find their rotations: a few times the 7 coefficients of degree 3.
+#: Sampled directions for finding SH rotations: a few times the 7 coefficients of degree 3.
 SAMPLES = 64
 
-#: Splats that are worked on at a time: their float64 copies stay in a processor's cache.
+#: Splats transformed at a time: their float64 copies stay in a processor's cache.
 ROWS = 1 << 12
 
-#: Degrees about x that turn the axis of a file that points up to +y.
+#: Degrees about x that turn each up axis to +y.
 _DEGREES_OF_UP = dict(zip(UP_AXES, (0.0, 180.0, -90.0, 90.0), strict=True))
 
 
@@ -122,7 +122,7 @@ class Transform:
 
     @classmethod
     def from_quat(cls, quat_xyzw: ArrayLike) -> Transform:
-        """Return a rotation by a (4,) quaternion x y z w of any length but 0.
+        """Return a rotation by a (4,) quaternion x y z w of any positive length.
 
         Raises:
             ValueError: it has another shape, or a length of 0 or not finite.
@@ -166,41 +166,40 @@ class Transform:
             translate: x, y, z in world units, after scaling.
 
         Raises:
-            ValueError: one of them is out of range; its text says which and what to give.
+            ValueError: an argument is out of range.
         """
         rotation = cls.from_euler(*rotate).rotation @ cls.from_up(up).rotation
         return cls(rotation, scale, np.asarray(translate, np.float64))
 
     @property
     def is_identity(self) -> bool:
-        """Whether it leaves everything exactly where and as it is."""
+        """Whether the transform changes nothing at all."""
         return np.array_equal(self.rotation, np.eye(3)) and self.scale == 1 and not self.translation.any()
 
     @property
     def matrix(self) -> Matrix:
-        """(4, 4) float64 that multiplies column vectors x y z 1."""
+        """(4, 4) float64 matrix for column vectors x y z 1."""
         matrix = np.eye(4)
         matrix[:3, :3] = self.scale * self.rotation
         matrix[:3, 3] = self.translation
         return matrix
 
     def then(self, after: Transform) -> Transform:
-        """Return this transform followed by another, as one."""
+        """Return the composition: this transform first, then another."""
         translation = after.scale * (after.rotation @ self.translation) + after.translation
         return Transform(after.rotation @ self.rotation, after.scale * self.scale, translation)
 
     def inverse(self) -> Transform:
-        """Return the transform that undoes this one."""
+        """Return the inverse transform."""
         back = self.rotation.T
         return Transform(back, 1 / self.scale, -(back @ self.translation) / self.scale)
 
     def apply(self, splats: Splats) -> Splats:
-        """Return splats rotated, scaled and moved: computed in float64, rounded once to float32.
+        """Rotate, scale and move splats: computed in float64, rounded once to float32.
 
-        The identity returns `splats` itself, and columns that a transform leaves alone are shared, not copied.
-        Quaternions keep their length, so that invalid ones stay invalid, and are not brought to one hemisphere:
-        q becomes r * q, where w of r is not negative. A splat that leaves the range of float32 becomes infinite, and
-        so invalid.
+        The identity returns `splats` itself, and unchanged columns are shared, not copied. Quaternions keep their
+        length, so that invalid ones stay invalid, and may have any sign: q becomes r * q, where w of r is not negative.
+        A number beyond the range of float32 becomes infinite, which makes its splat invalid.
         """
         if self.is_identity:
             return splats
@@ -230,7 +229,7 @@ def scale_of(matrix: Matrix, skew: float) -> float | None:
     """Return the scale of a (4, 4) matrix of a rotation, a uniform scale and a translation; None for any other matrix.
 
     Args:
-        skew: how far its axes may be from right angles, and from one length, as a share.
+        skew: largest deviation of its axes from right angles and from equal length, as a share.
     """
     axes = matrix[:3, :3]
     with np.errstate(all="ignore"):
@@ -243,9 +242,9 @@ def sh_rotations(rotation: Matrix, degree: int) -> list[Matrix]:
     """Return the matrices by which a rotation multiplies the SH coefficients of the degrees 1 to `degree`.
 
     A colour f(d) = Y(d) c becomes f(R^-1 d), so Y(d) c' = Y(R^-1 d) c for all d: c' = X c, where X is the solution of
-    Y(d) X = Y(R^-1 d). It is exact, as the functions of a degree turn among themselves; least squares over more
-    directions than coefficients find it to float64.
-    They are (3, 3), (5, 5) and (7, 7) orthogonal float64.
+    Y(d) X = Y(R^-1 d). It is exact, as rotations map the functions of a degree to each other; least squares over more
+    directions than coefficients find it in float64 precision.
+    The matrices are (3, 3), (5, 5) and (7, 7) orthogonal float64.
     """
     # Spread evenly: a spiral from pole to pole by the golden angle.
     index = np.arange(SAMPLES)
@@ -266,8 +265,8 @@ def sh_rotations(rotation: Matrix, degree: int) -> list[Matrix]:
 def sh_basis(directions: Matrix, degree: int) -> Matrix:
     """Return (N, K) real spherical harmonics of degree 1 to `degree` in (N, 3) unit directions, as `Splats.sh`.
 
-    The polynomials and signs are those of the code that trained 3D Gaussian Splatting (`eval_sh` there); the rasterizer
-    has them in `kernels/shade.py`.
+    The polynomials and signs are those of `eval_sh` in the original code of 3D Gaussian Splatting; the rasterizer has
+    them in `kernels/shade.py`.
     """
     x, y, z = directions.T
     columns = [SH_C1 * -y, SH_C1 * z, SH_C1 * -x] if degree else []
@@ -289,7 +288,7 @@ def sh_basis(directions: Matrix, degree: int) -> Matrix:
 
 
 def _quat_product(rotation: Matrix) -> Matrix:
-    """Return (4, 4) that multiplies quaternions x y z w from the left by that of a rotation, of w >= 0."""
+    """Return the (4, 4) matrix of the product r * q, where r is the quaternion of a rotation with w >= 0."""
     quat = quat_of_rotation(rotation)
     quat[np.abs(quat) < SNAP] = 0
     first = quat[3] or quat[np.argmax(np.abs(quat))]  # half turns have no w: then the largest part is positive
@@ -298,16 +297,16 @@ def _quat_product(rotation: Matrix) -> Matrix:
 
 
 def _multiplied(matrix: Matrix, rows: FloatArray) -> Matrix:
-    """Return (N, K) rows times a (K, K) matrix, as (N, K) float64.
+    """Return (N, K) float64, each row multiplied by a (K, K) matrix.
 
-    Sums are in a fixed order, which BLAS would choose by processor and threads; columns are what einsum is fast with.
+    With einsum, sums have a fixed order, which BLAS would choose by processor and threads. Columns make it fast.
     """
     columns: Matrix = np.einsum("ij,jn->in", matrix, rows.T.astype(np.float64, order="C"))
     return columns.T
 
 
 def _turn_sh(of_degrees: list[Matrix], sh: FloatArray, out: FloatArray) -> None:
-    """Fill (N, K, 3) coefficients with those of turned splats, degree by degree; as `_multiplied`."""
+    """Fill (N, K, 3) with rotated SH coefficients, degree by degree; see `_multiplied` on einsum."""
     count, start = len(sh), 0
     for turn in of_degrees:
         part = slice(start, start + len(turn))
@@ -320,7 +319,7 @@ def _turn_sh(of_degrees: list[Matrix], sh: FloatArray, out: FloatArray) -> None:
 #: Equatorial radius in metres, and the flattening of WGS 84.
 RADIUS, FLATTENING = 6_378_137.0, 1 / 298.257223563
 
-#: Steps by which a latitude is found: each leaves a hundredth of the error near the surface.
+#: Iterations for a latitude: each leaves a hundredth of the error near the surface.
 ROUNDS = 8
 
 #: A (4, 4) matrix for column vectors, column by column, as 3D Tiles and glTF write it.
@@ -330,7 +329,7 @@ IDENTITY: Matrix16 = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0
 
 
 def earth_matrix(latitude: float, longitude: float, height: float = 0.0, heading: float = 0.0) -> Matrix16:
-    """Return the matrix that puts the origin of local axes at a place, z up.
+    """Return the matrix from local axes, z up, with their origin at a place, to those of the Earth.
 
     Args:
         latitude, longitude: degrees, north and east positive; geodetic.
@@ -366,7 +365,7 @@ class EarthPlace:
 
 
 def place_of(matrix: Matrix16) -> EarthPlace:
-    """Return the place of the origin of a matrix that is not at the centre of the Earth; inverse of `earth_matrix`."""
+    """Return the place of a matrix, the inverse of `earth_matrix`; its origin must not be the centre of the Earth."""
     x, y, z = matrix[12:15]
     ahead = matrix[4:7]
     lam, across, squared = math.atan2(y, x), math.hypot(x, y), FLATTENING * (2 - FLATTENING)

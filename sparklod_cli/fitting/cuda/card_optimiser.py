@@ -1,9 +1,8 @@
-"""`CardOptimiser`: steps on a card, where the nodes, their moments and the pictures of full detail lie."""
+"""`CardOptimiser`: steps on a card, with the nodes, their moments and the pictures of full detail in its memory."""
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,15 +12,6 @@ from ...render.cuda.card_rasterizer import CardPicture, CardSplats, CardView, dr
 from ..kernels import adam
 from ..pictures import LEAST_ERROR, FittedNodes, FullDetailPicture, Index, Optimiser, slots_of
 from . import kernels
-
-
-@dataclass(frozen=True)
-class _CardExample:
-    """A camera and its picture of full detail on the card."""
-
-    picture: FullDetailPicture
-    view: CardView
-    full: CardArray
 
 
 class CardOptimiser(Optimiser):
@@ -42,18 +32,21 @@ class CardOptimiser(Optimiser):
             moments = (*(np.zeros(shape, np.float32) for shape in shapes), np.zeros(count, np.int32))
             self._moments = adam.Moments(*map(to_card, moments))
             self._rates = on_card(len(adam.Rates._fields))
-        # By identity: the pictures of a fit live as long as the fit.
-        self._examples: dict[int, _CardExample] = {}
+        # Cameras and pictures on the card, by the identity of pictures, which live as long as the fit.
+        self._examples: dict[int, tuple[CardView, CardArray]] = {}
 
     def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
         with self._errors():
-            example = self._example(picture)
+            if id(picture) not in self._examples:
+                view = CardView.of(picture.camera, self.nodes.raster)
+                self._examples[id(picture)] = view, to_card(picture.full)
+            view, full = self._examples[id(picture)]
             drawn = self._now.memory.array("index", len(index), np.int32)
             if len(index):
                 drawn.copy_to_device(index.astype(np.int32))
-            seen = draw_on_card(self._now, drawn, example.view)
-            gradients = gradients_on_card(self._now, seen, example.view, self._by_image(seen, example))
-            moved = self._move(drawn, example.view, gradients, rates)
+            seen = draw_on_card(self._now, drawn, view)
+            gradients = gradients_on_card(self._now, seen, view, self._by_image(seen, full))
+            moved = self._move(drawn, view, gradients, rates)
         self._moved.append((index, moved))
 
     def place(self) -> None:
@@ -61,21 +54,14 @@ class CardOptimiser(Optimiser):
             self.nodes.place(index, moved[:, :3], moved[:, 3])
         self._moved.clear()
 
-    def _example(self, picture: FullDetailPicture) -> _CardExample:
-        """Return a picture on the card, uploaded when it is first used."""
-        if id(picture) not in self._examples:
-            view = CardView.of(picture.camera, self.nodes.raster)
-            self._examples[id(picture)] = _CardExample(picture, view, to_card(picture.full))
-        return self._examples[id(picture)]
-
-    def _by_image(self, seen: CardPicture, example: _CardExample) -> CardArray:
+    def _by_image(self, seen: CardPicture, full: CardArray) -> CardArray:
         """Return the derivative of the mean logarithm of the errors; see `FullDetailPicture.gradient`."""
         new, (height, width, _) = self._now.memory.array, seen.image.shape
         sums, weights = new("errors", (height, 2), np.float64), new("weights", 2)
         result = new("by image", seen.image.shape)
-        kernels.squared_differences.launch(height, kernels.ROW_THREADS, seen.image, example.full, sums)
+        kernels.squared_differences.launch(height, kernels.ROW_THREADS, seen.image, full, sums)
         kernels.weigh_backgrounds.launch(1, 32, sums, float(height * width * 3), LEAST_ERROR, weights)
-        kernels.by_image.for_each(height * width, seen.image, example.full, weights, result)
+        kernels.by_image.for_each(height * width, seen.image, full, weights, result)
         return result
 
     def _move(self, index: CardArray, view: CardView, gradients: CardArray, rates: adam.Rates) -> np.ndarray:
