@@ -1,4 +1,4 @@
-"""The server of a site: files by their names and nothing else, in ranges, to pages of its own by default."""
+"""The server of a site: sends resources of the site and nothing else, by default only to its own page."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from .site import CAMERAS, INDEX, MAX_BYTES, Site, parse_drop
 #: Default address of a server: only programs of this machine can connect.
 LOOPBACK = "127.0.0.1"
 
-#: Names of this machine that a Host header may have where the server listens on loopback.
+#: Names of this machine in a Host header, if the server listens on loopback.
 OWN_NAMES = ("localhost", LOOPBACK, "[::1]")
 
 #: Seconds that a connection may be idle.
 IDLE = 60
 
-#: Headers of every answer.
+#: Headers of every response.
 ALWAYS = {"X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "Cache-Control": "no-cache"}
 
-#: Headers of an answer that pages of other origins may read, and of one that they may neither read nor embed.
+#: Headers of responses that pages of other origins may read, and of responses that they may neither read nor embed.
 SHARED = {
     "Access-Control-Allow-Origin": "*",
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
@@ -45,30 +45,33 @@ SHARED = {
 }
 PRIVATE = {"Cross-Origin-Resource-Policy": "same-origin"}
 
-#: Headers of the answer to a preflight request, with --cors.
+#: Headers of the response to a preflight request, with --cors.
 PREFLIGHT = {
     "Access-Control-Allow-Methods": "GET, HEAD",
     "Access-Control-Allow-Headers": "Range, If-Range",
     "Access-Control-Max-Age": "600",
 }
 
-#: A Range header (RFC 9110, section 14) of one range: from a first byte to a last one, from a first on, or the last.
+#: A Range header (RFC 9110, section 14) with one range: first and last byte, first byte, or a number of last bytes.
 RANGE = re.compile(r"bytes\s*=\s*([0-9]*)\s*-\s*([0-9]*)\s*", re.IGNORECASE | re.ASCII)
 
-#: Most digits of a number of bytes in a request; a longer number exceeds the size of any file.
+#: Most digits of a number of bytes in a request; longer numbers exceed the size of any file.
 DIGITS = 18
-
-#: Receives one line about each request.
-Log = Callable[[str], None]
 
 
 class Server(ThreadingHTTPServer):
-    """Serves a site, a thread for each connection; port 0 is any free one; `SparklodError` if it cannot listen."""
+    """Serves a site, with a thread for each connection; `SparklodError` if it cannot listen.
+
+    Args:
+        port: 0 for any free port.
+        cors: let pages of other origins read the files.
+        log: receives a line about each request.
+    """
 
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, site: Site, *, host: str, port: int, cors: bool, log: Log) -> None:
+    def __init__(self, site: Site, *, host: str, port: int, cors: bool, log: Callable[[str], None]) -> None:
         self.site, self.cors, self.log = site, cors, log
         try:
             family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -81,20 +84,20 @@ class Server(ThreadingHTTPServer):
         self.names = {*OWN_NAMES, host.lower()}
 
     def server_bind(self) -> None:
-        """Bind the socket; unlike the base class, without asking a name server for the name of the machine."""
+        """Bind the socket, without the base class's query for the name of the machine."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     @property
     def url(self) -> str:
-        """The address of the page, for a browser of this machine."""
+        """Address of the page, for a browser on this machine."""
         host = str(self.server_address[0])
         if ipaddress.ip_address(host.partition("%")[0]).is_unspecified:
             host = "::1" if ":" in host else LOOPBACK
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log an unexpected error; it ends the connection, not the server."""
+        """Log an unexpected error, which ends the connection, not the server."""
         self.log(f"a connection failed: {type(sys.exc_info()[1]).__name__}: {sys.exc_info()[1]}")
 
 
@@ -127,12 +130,12 @@ class Handler(BaseHTTPRequestHandler):
             self._send_resource(body=False)
 
     def do_OPTIONS(self) -> None:
-        """Send the headers and methods that a page of another origin may use."""
+        """Send the methods and, with --cors, the headers that a page of another origin may use."""
         if self._is_ours():
             self._answer(HTTPStatus.NO_CONTENT, {"Allow": "GET, HEAD", **(PREFLIGHT if self.server.cors else {})})
 
     def do_POST(self) -> None:
-        """Parse a camera path that was dropped onto our page."""
+        """Parse a camera path dropped onto the page."""
         if not self._is_ours():
             return
         if self.path != f"/{CAMERAS}":
@@ -161,7 +164,10 @@ class Handler(BaseHTTPRequestHandler):
         return None
 
     def _is_ours(self) -> bool:
-        """Whether the request names this server: a page elsewhere whose name leads here must not read our files."""
+        """Return whether the Host header names this server, or refuse the request.
+
+        Another site whose name resolves to this address must not read the files.
+        """
         if not self.server.loopback:
             return True
         host, _, port = self.headers.get("Host", "").lower().rpartition(":")
@@ -225,13 +231,13 @@ class Handler(BaseHTTPRequestHandler):
             return
         self.wfile.flush()
         sent = 0
-        with contextlib.suppress(ConnectionError, TimeoutError):  # the browser wants no more of it
+        with contextlib.suppress(ConnectionError, TimeoutError):  # the browser has lost interest
             sent = self.connection.sendfile(file, first, count)
-        if sent < count:  # the file has become shorter, too: the closed connection reports it
+        if sent < count:  # or the file was truncated, which closing the connection reports
             self.close_connection = True
 
     def _refuse(self, status: HTTPStatus, text: str, headers: Mapping[str, str] | None = None) -> None:
-        """Send an error; its body may be unread, so the connection ends."""
+        """Send an error and end the connection, since the body of the request may be unread."""
         self.close_connection = True
         more = {"Content-Type": "text/plain; charset=utf-8", "Connection": "close", **(headers or {})}
         self._answer(status, more, f"{text}\n".encode(), body=self.command != "HEAD")
@@ -257,26 +263,17 @@ class Handler(BaseHTTPRequestHandler):
 
 
 def span_of(text: str | None, size: int) -> range | None:
-    """Return the bytes of a file that a Range header names, empty if the file has none of them; None for all of them.
+    """Return the bytes of a file that a Range header names, an empty range if it has none of them, or None for all.
 
-    The whole file is sent without a header, and where a server may ignore it: of another unit, with several ranges, or
-    broken.
+    A server may ignore a header of another unit, with several ranges, or broken, and send the whole file.
     """
     found = RANGE.fullmatch(text.strip()) if text is not None else None
-    if found is None:
+    if found is None or not any(found.groups()):
         return None
-    first, last = found.groups()
-    if first:
-        begin = _number(first)
-        end = _number(last) if last else max(begin, size)
-        if end < begin:
-            return None
-        return range(begin, max(begin, min(end + 1, size)))
-    if last:
-        return range(size - min(_number(last), size), size)
-    return None
-
-
-def _number(digits: str) -> int:
-    digits = digits.lstrip("0")
-    return int(digits or "0") if len(digits) <= DIGITS else 10**DIGITS
+    digits = [each.lstrip("0") if each else None for each in found.groups()]
+    first, last = (None if each is None else int(each or "0") if len(each) <= DIGITS else 10**DIGITS for each in digits)
+    if first is None:
+        return range(size - min(last or 0, size), size)
+    if last is not None and last < first:
+        return None
+    return range(first, size if last is None else min(last + 1, size)) if first < size else range(0)

@@ -1,6 +1,6 @@
-"""Files that a page shows: the names under which they are served, their extents, and the first view of them.
+"""Splat files of a page: the names under which they and their companions are served, extents, and the first view.
 
-A site is a closed table of names: nothing else is served, so no name can lead out of it.
+A site serves nothing but a closed table of names, so no name can lead out of it.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import functools
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras import DEFAULT_SIZE, ELEVATION, framing
-from ..cameras.camera import DEFAULT_FOV_Y, Matrix, Settings
+from ..cameras.camera import DEFAULT_FOV_Y, Settings
 from ..cameras.framing import Balls, balls_of
 from ..cameras.sources import single_views, whole_scene
-from ..codecs.formats import META, ZIP, head_of, sniff
+from ..codecs.formats import META, ZIP, Format, head_of, sniff
 from ..codecs.gltf import open_content as open_glb
 from ..codecs.gltf_container import MAGIC as GLB_MAGIC
 from ..codecs.losses import MOST_PAGED_DEGREE, sample_loss
@@ -56,7 +56,7 @@ SPARK_TYPES = {
 #: Engines of formats that Spark does not read.
 OTHER_ENGINES = {"Streamed SOG": "playcanvas", "GLB": "playcanvas", "3D Tiles": "cesium"}
 
-#: Patterns of the beginnings of files that sparklod reads and Spark 2.2.0 does not, with names of their formats.
+#: Patterns of the first bytes of files that sparklod reads and Spark 2.2.0 does not, with names of their formats.
 UNREAD = (
     (rb"NGSP", "SPZ version 4"),
     (rb"ply\s+((comment|obj_info)\b.*\s+)*format\s+(?!binary_little)", "PLY that is ascii or big-endian"),
@@ -65,7 +65,7 @@ UNREAD = (
 #: Engines that show files, and their names for display.
 ENGINES = {"spark": "Spark", "playcanvas": "PlayCanvas", "cesium": "CesiumJS"}
 
-#: Media types by suffix; anything else is bytes.
+#: Media types by suffix, and that of other files.
 MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -86,38 +86,40 @@ Resources = Mapping[str, bytes | Path]
 
 @dataclass(frozen=True)
 class ShownFile:
-    """A splat file that the page shows.
+    """A splat file of a page.
 
     Attributes:
         url: relative to the page.
-        format: for display: "RAD", "SPZ".
-        spark_type: Spark's name of its format; None if another engine shows it.
+        format: name of the format, for display.
         files: paths of the file and its companions, by the names under which they are served.
         note: why Spark will not show it; None if no reason is known.
     """
 
     path: Path
-    name: str
     url: str
     format: str
-    spark_type: str | None
     header: RadHeader | None
     files: Mapping[str, Path]
     note: str | None = None
 
     @property
+    def name(self) -> str:
+        """Name of the file, for display."""
+        return printable(self.path.name)
+
+    @property
     def engine(self) -> str:
-        """Engine that shows the file, one of `ENGINES`."""
+        """Engine of the format, one of `ENGINES`."""
         return OTHER_ENGINES.get(self.format, "spark")
 
     @property
     def paged(self) -> bool:
-        """Whether Spark can load it chunk by chunk."""
+        """Whether Spark can load the file chunk by chunk."""
         return self.header is not None and self.header.lod_tree and self.header.chunk_size == CHUNK_NODES
 
     @property
     def bytes(self) -> int:
-        """Size of all files together, bytes."""
+        """Total size of the files."""
         return sum(path.stat().st_size for path in self.files.values())
 
 
@@ -127,11 +129,11 @@ def media_type(name: str) -> str:
 
 
 def shown_files(paths: Sequence[Path]) -> list[ShownFile]:
-    """Return the files that a page shows, each with the files it refers to.
+    """Recognise splat files and find their companions.
 
     Raises:
-        FormatError: a file cannot be read, is of no known format, or refers to one that is missing or elsewhere; or
-            they are for different engines; the text names it.
+        FormatError: a file cannot be read, is of an unknown format, or refers to a file that is missing or outside its
+            folder, or the files need different engines. The message names the file.
     """
     shown = [_named(path, f"data/{number}") for number, path in enumerate(paths)]
     other = next((file for file in shown if file.engine != shown[0].engine), None)
@@ -154,7 +156,8 @@ def _shown(path: Path, folder: str) -> ShownFile:
         return _shown(path / in_folder(path).name, folder)
     if path.exists() and not path.is_file():
         raise UnreadableError("it is a pipe or a device; save it to a file first")
-    header = None
+    name, header = f"{folder}/{path.name}", None
+    files = {name: path.resolve()}
     with open_plain(path.resolve()) as file:
         head = head_of(file)
         form = sniff(head, path.suffix)
@@ -168,22 +171,15 @@ def _shown(path: Path, folder: str) -> ShownFile:
             raise NotSplatsError("Spark does not read an unpacked SOG; zip its files into a .sog")
         elif form.unbundled == META and (first := ZipFolder(file).first) != META:
             raise NotSplatsError(f"viewers do not read {first} in a zip; unzip it, and give the folder")
-    if form.name not in SPARK_TYPES | OTHER_ENGINES:
-        raise NotSplatsError(f"Spark does not read {form.name}; bake it first with sparklod build-lod")
-    name = f"{folder}/{path.name}"
-    files = {name: path.resolve()}
-    if form.parts is not None:
-        companions = _tileset_files(path) if form.parts == "tiles" else _manifest_files(path)
-        files |= {f"{folder}/{each}": _inside(path, path.parent / each) for each in companions}
-    elif header is not None:
-        files |= {f"{folder}/{chunk}": companion for chunk, companion in _chunk_files(path, header)}
-    note = _note(path.name, head, header)
-    file_type = SPARK_TYPES.get(form.name)
-    return ShownFile(path, printable(path.name), quote(os.fsencode(name)), form.name, file_type, header, files, note)
+        if form.name not in SPARK_TYPES | OTHER_ENGINES:
+            raise NotSplatsError(f"Spark does not read {form.name}; bake it first with sparklod build-lod")
+        for each in _companions(path, file, form, header):
+            files[f"{folder}/{each}"] = _real_path(path, path.parent / each, CHUNK_MAGIC if header is not None else b"")
+    return ShownFile(path, quote(os.fsencode(name)), form.name, header, files, _note(path.name, head, header))
 
 
 def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
-    """Return why Spark will not show a file, judged by its beginning; None if it may."""
+    """Return the reason, visible in the first bytes of a file, why Spark will not show it; None if there is none."""
     for beginning, what in UNREAD:
         if re.match(beginning, head):
             return f"{name}: Spark 2.2.0 does not read {what}; bake it first with sparklod build-lod"
@@ -197,44 +193,30 @@ def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
     return None
 
 
-def _chunk_files(path: Path, header: RadHeader) -> Iterator[tuple[str, Path]]:
-    for name in header.filenames:
-        check_companion(name)
-        companion = path.parent / name
-        if not companion.is_file():
-            raise FormatError(f"its chunk file {quoted_value(name)} is missing")
-        real = _inside(path, companion)
-        with open_plain(real) as file:
-            if file.read(len(CHUNK_MAGIC)) != CHUNK_MAGIC:
-                raise FormatError(f"{quoted_value(name)}, which it names, is no RAD chunk; nothing is published")
-        yield name, real
-
-
-def _manifest_files(path: Path) -> list[str]:
-    """Return the names of all files that readers of a Streamed SOG open; `FormatError` where one is missing."""
-    with open_plain(path.resolve()) as file:
-        manifest = parse(file.read(MAX_MANIFEST + 1))
-    names = dict[str, None]()
-    for name in manifest.read_names():
+def _companions(path: Path, file: BinaryIO, form: Format, header: RadHeader | None) -> Iterable[str]:
+    """Return the names of all files that viewers read with a splat file; `FormatError` if one is missing."""
+    open_beside = functools.partial(open_named, path, folders=True)
+    file.seek(0)
+    if form.parts == "tiles":
+        names = dict.fromkeys(names_of(file.read(MAX_TILESET + 1), open_beside))
+        for name in names:
+            open_beside(name).close()
+        return names
+    is_manifest, names = form.parts is not None, {}
+    chunks = parse(file.read(MAX_MANIFEST + 1)).read_names() if is_manifest else header.filenames if header else ()
+    for name in chunks:
+        check_companion(name, folders=is_manifest)
         if not (path.parent / name).is_file():
             raise FormatError(f"its chunk file {quoted_value(name)} is missing")
-        names |= dict.fromkeys(files_of_chunk(functools.partial(open_named, path, folders=True), name))
-    return list(names)
-
-
-def _tileset_files(path: Path) -> list[str]:
-    """Return the names of all files that a tileset refers to; `FormatError` where one is missing or elsewhere."""
-    with open_plain(path.resolve()) as file:
-        names = names_of(file.read(MAX_TILESET + 1), functools.partial(open_named, path, folders=True))
-    for name in names:
-        open_named(path, name, folders=True).close()
+        names |= dict.fromkeys(files_of_chunk(open_beside, name) if is_manifest else [name])
     return names
 
 
-def _inside(path: Path, companion: Path) -> Path:
-    """Return the real path of a file that another one names; raises `FormatError` if it must not be published.
+def _real_path(path: Path, companion: Path, magic: bytes) -> Path:
+    """Return the real path of a file that a splat file names; `FormatError` if it must not be published.
 
-    The author of a manifest is untrusted, and chooses which of the files beside it are published.
+    The author of the splat file is untrusted, but chooses which of the files beside it are published: only those that
+    are named like a part of a scene and begin with `magic`.
     """
     name = companion.relative_to(path.parent)
     if name.suffix.lower() not in PARTS or any(part.startswith(".") for part in name.parts):
@@ -245,6 +227,11 @@ def _inside(path: Path, companion: Path) -> Path:
     real = companion.resolve()
     if real.parent != path.parent.resolve() / name.parent:
         raise FormatError(f"{quoted_value(companion.name)}, which it names, is a link to another folder; copy it there")
+    if magic:
+        with open_plain(real) as file:
+            if file.read(len(magic)) != magic:
+                what = quoted_value(companion.name)
+                raise FormatError(f"{what}, which it names, is no RAD chunk; nothing is published")
     return real
 
 
@@ -254,10 +241,10 @@ Point = tuple[float, float, float]
 #: Vertical field of view where none is given, degrees.
 FOV = round(math.degrees(DEFAULT_FOV_Y), 9)
 
-#: Percentiles of feature sizes between which colours differ; few nodes of a tree are coarse.
+#: Percentiles of the range of feature sizes; few nodes of a tree are coarse.
 SIZES = 1, 99.9
 
-#: Assumed ratio of the smallest splats in the first chunk of a large RAD tree to the smallest of the tree.
+#: Assumed ratio of the smallest splats in the first chunk of a RAD tree to the smallest of the tree.
 BELOW = 8
 
 
@@ -268,10 +255,10 @@ class Extent:
     Attributes:
         splats: number of splats, or of nodes of a tree.
         leaves: number of leaves of a tree, or of splats at full detail of a file with levels; None without either.
-        balls: bounding spheres of its splats; of a large RAD tree, of the coarsest only.
-        sizes: (2,) range of the feature sizes of its splats without outliers, world units.
+        balls: bounding spheres of the splats, or of the coarsest.
+        sizes: range of the feature sizes without outliers, world units.
         up, up_by: as in `Scene`.
-        levels: number of detail levels; None for a file without.
+        levels: number of detail levels; None without levels.
         layout: layout of the splats in Spark's memory, "ext" or "packed".
     """
 
@@ -285,28 +272,8 @@ class Extent:
     up_by: str = ""
 
 
-@dataclass(frozen=True)
-class Start:
-    """The first view of the scene.
-
-    Attributes:
-        fov: vertical field of view, degrees.
-        radius: of a ball around `center` that most splats are in, world units.
-        sizes: smallest and largest feature size, world units.
-        chosen: the view was chosen for the scene, not given.
-    """
-
-    eye: Point
-    target: Point
-    fov: float
-    center: Point
-    radius: float
-    sizes: tuple[float, float]
-    chosen: bool
-
-
 def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent) -> Extent:
-    """Return the extent of a file, for the first view; a `SparklodError` about a broken one names it."""
+    """Measure the extent of a file; a `SparklodError` about a broken file names it."""
     try:
         with naming(shown.path):
             if shown.header is not None and shown.header.lod_tree and len(shown.header.chunks) > 1:
@@ -318,16 +285,9 @@ def extent_of(shown: ShownFile, *, threads: int = 1, progress: Progress = silent
     except OSError as error:
         raise UnreadableError(f"{shown.path}: cannot be read: {reason_of(error)}") from None
     leaves = None if scene.tree is None else np.flatnonzero(scene.tree.is_leaf)
-    index = slice(None) if leaves is None else leaves
-    return Extent(
-        len(scene.splats),
-        None if leaves is None else len(leaves),
-        balls_of(scene.splats, index, np.eye(4)),
-        _sizes(scene.splats),
-        scene.up,
-        layout=_layout(shown, scene.splats),
-        up_by=scene.up_by,
-    )
+    balls = balls_of(scene.splats, slice(None) if leaves is None else leaves, np.eye(4))
+    sizes, layout, count = _sizes(scene.splats), _layout(shown, scene.splats), None if leaves is None else len(leaves)
+    return Extent(len(scene.splats), count, balls, sizes, scene.up, layout=layout, up_by=scene.up_by)
 
 
 def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
@@ -353,14 +313,14 @@ def _coarse_extent(shown: ShownFile, header: RadHeader) -> Extent:
 
 
 def _layout(shown: ShownFile, splats: Splats) -> str:
-    """Return the layout in which Spark shows these splats of a file best, or at all."""
+    """Return the layout in which Spark shows the splats of a file best, or at all."""
     if shown.paged and splats.sh_degree > MOST_PAGED_DEGREE:
         return "packed"
     return sample_loss(splats).better
 
 
 def _parts_extent(scene: DetailScene | TileScene) -> Extent:
-    """Return the extent by the coarsest level that has splats; without an environment, which is all around."""
+    """Measure the coarsest level that has splats, without an environment, which surrounds everything."""
     coarse: NDArray[Any] | slice
     if isinstance(scene, DetailScene):
         coarse, leaves, levels = scene.level(scene.levels - 1), scene.counts[:, 0].sum(), scene.levels
@@ -373,7 +333,7 @@ def _parts_extent(scene: DetailScene | TileScene) -> Extent:
 
 
 def _sizes(splats: Splats) -> tuple[float, float]:
-    """Return the range of the feature sizes of splats, with opacity taken as at most 1; both ends are above 0."""
+    """Return the range of the feature sizes of splats with opacities of at most 1; both ends are above 0."""
     sizes = 2 * splats.scale[:: max(len(splats) // framing.SAMPLE, 1)].mean(axis=1, dtype=np.float64)
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
     if not len(sizes):
@@ -382,29 +342,36 @@ def _sizes(splats: Splats) -> tuple[float, float]:
     return smallest, largest
 
 
-def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Point, fov: float) -> Start:
-    """Return the first view of some files together; `CameraPathError` if the camera makes no sense.
+def start_of(extents: Sequence[Extent], view: tuple[Point, Point] | None, up: Point, fov: float) -> dict[str, Any]:
+    """Return the first view of files, for the settings of the page; `CameraPathError` if the camera is invalid.
 
-    `view` is an eye and a target; None for the whole scene from its front.
+    Args:
+        view: eye and target; None for the whole scene from its front.
+        fov: vertical field of view, degrees.
+
+    Returns:
+        "eye", "target" and "fov" of the camera; "center" and "radius" of a ball around most splats; "sizes", the
+        smallest and the largest feature size; "chosen" if the view was chosen for the scene.
     """
     balls = Balls.concat(extent.balls for extent in extents)
     settings = Settings(size=DEFAULT_SIZE, fov_y=math.radians(fov), up=up)
     try:
         middle, radius = framing.framing(balls.center)
-    except InvalidSplatsError:  # nothing that could be framed
+    except InvalidSplatsError:  # there is nothing to frame
         middle, radius, view = np.zeros(3), 1.0, view or ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
     path = whole_scene(ELEVATION, settings, lambda: balls) if view is None else single_views((view,), settings)
     (camera,) = path.cameras
-    sizes = min(extent.sizes[0] for extent in extents), max(extent.sizes[1] for extent in extents)
-    target: Sequence[float] | Matrix
     if view is None:  # the point on the axis of the camera that is nearest to the middle
         away = float((middle - camera.position) @ camera.forward)
         target = camera.position + camera.forward * (away if away > 0 else 1.0)
     else:
-        target = view[1]
-    return Start(_point(camera.position), _point(target), fov, _point(middle), radius, sizes, chosen=view is None)
-
-
-def _point(values: Sequence[float] | Matrix) -> Point:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
+        target = np.array(view[1], np.float64)
+    return {
+        "eye": camera.position.tolist(),
+        "target": target.tolist(),
+        "fov": fov,
+        "center": middle.tolist(),
+        "radius": radius,
+        "sizes": [min(extent.sizes[0] for extent in extents), max(extent.sizes[1] for extent in extents)],
+        "chosen": view is None,
+    }

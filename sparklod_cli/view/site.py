@@ -1,8 +1,7 @@
-"""A site: the page, its settings and camera paths, and all files that it may ask for; its export into a folder."""
+"""A site: the page with its settings, camera paths, libraries and splat files; and its export into a folder."""
 
 from __future__ import annotations
 
-import base64
 import binascii
 import contextlib
 import dataclasses
@@ -13,7 +12,7 @@ import os
 import re
 import secrets
 import shutil
-from base64 import b64decode
+from base64 import b64decode, b64encode
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -32,21 +31,21 @@ from ..system.errors import CameraPathError, OutputError, SparklodError, reason_
 from ..system.output import try_place, write_file
 from ..system.progress import Progress, silent
 from ..system.untrusted import parse_json, printable, quoted_value
-from .shown_files import ENGINES, Extent, Resources, ShownFile, Start
+from .shown_files import ENGINES, SPARK_TYPES, Extent, Resources, ShownFile
 
 SPARK, PLAYCANVAS, CESIUM, THREE = "@sparkjsdev/spark", "playcanvas", "cesium", "three"
 
 #: npm packages of each engine of `shown_files.ENGINES`; the page itself uses the vectors of three.js.
 PACKAGES = {"spark": (SPARK, THREE), "playcanvas": (PLAYCANVAS, THREE), "cesium": (CESIUM, THREE)}
 
-#: The versions that the page was tested with.
+#: Versions with which the page was tested.
 VERSIONS = {SPARK: "2.2.0", PLAYCANVAS: "2.23.3", CESIUM: "1.145.0", THREE: "0.187.0"}
 
-#: A CDN of npm packages, with the files of each as published.
+#: A CDN of npm packages as published.
 CDN = "https://cdn.jsdelivr.net/npm"
 
-#: Modules by package and path, with their SHA-384 in the `VERSIONS`; a browser refuses a module of the CDN with another
-#: digest. Spark imports one module of the examples of three.js, whose main module imports its core.
+#: SHA-384 of modules in these versions, by package and path; a browser refuses a module of the CDN with another digest.
+#: Spark imports one module of the examples of three.js, whose main module imports its core.
 MODULES = {
     (SPARK, "dist/spark.module.js"): "OQEdbh3DPqIT6IsNEl9DQBNeBw4p2sTknDP1lrT6MjlQoTIEtzzM5LZ4ljB1QCh3",
     (PLAYCANVAS, "build/playcanvas.min.mjs"): "jIMtMpSIHxCHjnqekLLvZ9pz0cGMfA5JXdcO5YcNe5+Kn2IgCATDYJK4MjQVpxS+",
@@ -56,7 +55,7 @@ MODULES = {
 }
 
 #: Patterns of the other files that a package loads: workers of CesiumJS that pack and sort splats, their chunks, whose
-#: names change from version to version, and files that each of its scenes reads.
+#: names depend on the version, and files that each of its scenes reads.
 FILES = {
     CESIUM: (
         "Build/Cesium/index.js",
@@ -69,11 +68,11 @@ FILES = {
     )
 }
 
-#: Packages whose page must allow `eval` and inline styles: CesiumJS, as its Knockout evaluates text to find the global
-#: object, and its credits have inline styles.
+#: Packages that need `eval` and inline styles: Knockout in CesiumJS evaluates text to find the global object, and its
+#: credits have inline styles.
 LENIENT = {CESIUM}
 
-#: Import map of the page: module names, or their beginnings, with package and path.
+#: Import map of the page: names of modules, or prefixes of these, with package and path.
 MODULE_NAMES = {
     SPARK: (SPARK, "dist/spark.module.js"),
     PLAYCANVAS: (PLAYCANVAS, "build/playcanvas.min.mjs"),
@@ -82,37 +81,28 @@ MODULE_NAMES = {
     "three/addons/": (THREE, "examples/jsm/"),
 }
 
-#: File names of licenses, one of which each package has; it is served beside the modules, as the licenses require.
+#: File names of licenses, which must be served beside the modules; each package has one of them.
 LICENSES = ("LICENSE", "LICENSE.md")
 
 
 @dataclass(frozen=True)
 class Libraries:
-    """Addresses and files of the packages of an engine.
+    """Packages of an engine.
 
     Attributes:
         versions: by package.
-        source: for display: the address of the CDN, or the folder.
-        base: beginning of the addresses of all packages, absolute or relative to the page.
-        integrity: digests of the modules, by address; empty where the site itself serves them.
-        files: those that the site itself serves, by name.
+        source: address of the CDN or path of the folder, for display.
+        import_map: addresses of modules, and on a CDN their digests.
+        files: files that the site itself serves, by name.
     """
 
     versions: Mapping[str, str]
     source: str
-    base: str
-    integrity: Mapping[str, str]
+    import_map: Mapping[str, Mapping[str, str]]
     files: Mapping[str, Path]
 
-    def import_map(self) -> dict[str, dict[str, str]]:
-        imports = {
-            name: _url(self.base, package, self.versions[package] if self.integrity else None, path)
-            for name, (package, path) in MODULE_NAMES.items()
-            if package in self.versions
-        }
-        return {"imports": imports} | ({"integrity": dict(self.integrity)} if self.integrity else {})
-
     def notes(self) -> list[str]:
+        """Return a note for each version with which the page was not tested."""
         return [
             f"{self.source} has {package} {version}; the page was tested with {VERSIONS[package]}"
             for package, version in self.versions.items()
@@ -120,55 +110,50 @@ class Libraries:
         ]
 
 
-def _url(base: str, package: str, version: str | None, path: str) -> str:
-    return f"{base}/{package}{f'@{version}' if version else ''}/{path}"
-
-
 def from_cdn(engine: str = "spark") -> Libraries:
-    """Return the libraries of the CDN for an engine.
+    """Return the libraries of an engine on the CDN.
 
-    `SparklodError` if the engine loads workers, which a browser does not check by digests.
+    `SparklodError` if the engine loads workers, of which a browser does not check digests.
     """
-    if any(package in FILES for package in PACKAGES[engine]):
+    packages = PACKAGES[engine]
+    if any(package in FILES for package in packages):
         raise SparklodError(
             f"{ENGINES[engine]} cannot be taken from a CDN; install it with {_install(Path('DIR'), engine)} and give"
             " --spark-dir DIR"
         )
-    versions = {package: VERSIONS[package] for package in PACKAGES[engine]}
-    integrity = {
-        _url(CDN, package, versions[package], path): f"sha384-{digest}"
-        for (package, path), digest in MODULES.items()
-        if package in versions
-    }
-    return Libraries(versions, CDN, CDN, integrity, {})
+
+    def url(package: str, path: str) -> str:
+        return f"{CDN}/{package}@{VERSIONS[package]}/{path}"
+
+    imports = {name: url(*place) for name, place in MODULE_NAMES.items() if place[0] in packages}
+    integrity = {url(*place): f"sha384-{digest}" for place, digest in MODULES.items() if place[0] in packages}
+    versions = {package: VERSIONS[package] for package in packages}
+    return Libraries(versions, CDN, {"imports": imports, "integrity": integrity}, {})
 
 
 def from_folder(folder: Path, engine: str = "spark") -> Libraries:
-    """Return the libraries for an engine of a folder that has a node_modules, or is one.
+    """Return the libraries of an engine in a folder that has a node_modules, or is one.
 
-    `SparklodError`, with the way to install it, if a package, or a module of it, is missing.
+    `SparklodError`, with the command that installs it, if a package or one of its modules is missing.
     """
     packages = folder if folder.name == "node_modules" else folder / "node_modules"
     install = _install(folder, engine)
-    versions, files = {}, {}
+    versions, files, imports = {}, {}, {}
     for package in PACKAGES[engine]:
-        if not os.path.isdir(packages / package):  # noqa: PTH112, since `Path.is_dir` fails on names that are too long
-            raise SparklodError(f"{packages} has no {package}; install it with {install}")
-        versions[package] = _version(packages / package)
         home = packages / package
-        for pattern in (*LICENSES, *FILES.get(package, ())):
-            for found in home.glob(pattern):
-                files[f"lib/{package}/{found.relative_to(home).as_posix()}"] = found
-    for package, path in MODULES:
+        if not os.path.isdir(home):  # noqa: PTH112, since `Path.is_dir` fails on names that are too long
+            raise SparklodError(f"{packages} has no {package}; install it with {install}")
+        versions[package] = _version(home)
+        for pattern in (*LICENSES, *FILES.get(package, ()), *(path for each, path in MODULES if each == package)):
+            for found in filter(Path.is_file, home.glob(pattern)):
+                # Links, such as those of pnpm, are followed here, once.
+                files[f"lib/{package}/{found.relative_to(home).as_posix()}"] = found.resolve()
+    for name, (package, path) in MODULE_NAMES.items():
         if package in versions:
-            files[f"lib/{package}/{path}"] = packages / package / path
-    # A link, such as those of pnpm, is followed here, once.
-    files = {name: path.resolve() for name, path in files.items() if path.is_file()}
-    for package, path in MODULE_NAMES.values():
-        name = f"lib/{package}/{path}"
-        if package in versions and not path.endswith("/") and name not in files:
-            raise SparklodError(f"{packages / package} has no {path}; install {package} anew with {install}")
-    return Libraries(versions, str(folder), "./lib", {}, files)
+            imports[name] = f"./lib/{package}/{path}"
+            if not path.endswith("/") and f"lib/{package}/{path}" not in files:
+                raise SparklodError(f"{packages / package} has no {path}; install {package} anew with {install}")
+    return Libraries(versions, str(folder), {"imports": imports}, files)
 
 
 def _install(folder: Path, engine: str) -> str:
@@ -183,24 +168,33 @@ def _version(package: Path) -> str:
         raise SparklodError(f"{package / 'package.json'} has no version; install it anew with npm") from None
 
 
-#: Bytes of a request with camera files, in base64: COLMAP's images.txt of a large scene has 50 MB.
+#: Most bytes of a request with camera files in base64; COLMAP's images.txt of a large scene has 50 MB.
 MAX_BYTES = 1 << 27
 
 #: Most files dropped together; COLMAP's models have three.
 MAX_FILES = 16
 
-#: Most cameras of a path sent to the page; of a longer path, an even sample.
+#: Most cameras of a path sent to the page; a longer path is sampled evenly.
 MAX_CAMERAS = 20_000
 
 
 def parse_drop(body: bytes, settings: CameraSettings) -> dict[str, Any]:
-    """Return the path of some dropped files, as `frames_of` has it; `CameraPathError` if they are no camera path.
+    """Parse dropped camera files and return the path as `frames_of`; `CameraPathError` if they are invalid.
 
     Args:
         body: JSON, {"files": [{"name": text, "data": base64}]}.
-        settings: settings of the cameras; `up` is ignored for files whose cameras have up axes of their own.
+        settings: of the cameras; `up` is ignored for files whose cameras have up axes of their own.
     """
-    contents = _contents(body)
+    try:
+        files = parse_json(body)["files"]
+        contents = {file["name"]: b64decode(file["data"], validate=True) for file in files[:MAX_FILES]}
+    except (ValueError, KeyError, TypeError, binascii.Error):
+        contents = {}
+    if not contents:
+        raise CameraPathError("the request holds no files")
+    for name in contents:
+        if not isinstance(name, str) or leads_away(name):
+            raise CameraPathError(f"{quoted_value(name)} is no name of a file; rename it")
     first = next((names[0] for names in NAMES if names[0] in contents), next(iter(contents)))
     beside = next((names for names in NAMES if first in names), ())
     dropped = Files(Path(first), {name: contents[name] for name in (first, *beside) if name in contents})
@@ -213,22 +207,8 @@ def parse_drop(body: bytes, settings: CameraSettings) -> dict[str, Any]:
         raise CameraPathError(f"{first}: {error}") from None
 
 
-def _contents(body: bytes) -> Mapping[str, bytes]:
-    try:
-        files = parse_json(body)["files"]
-        contents = {file["name"]: b64decode(file["data"], validate=True) for file in files[:MAX_FILES]}
-    except (ValueError, KeyError, TypeError, binascii.Error):
-        contents = {}
-    if not contents:
-        raise CameraPathError("the request holds no files")
-    for name in contents:
-        if not isinstance(name, str) or leads_away(name):
-            raise CameraPathError(f"{quoted_value(name)} is no name of a file; rename it")
-    return contents
-
-
 def frames_of(path: CameraPath) -> dict[str, Any]:
-    """Return a camera path as the page plays it: camera-to-world matrices by columns, degrees and seconds."""
+    """Return a camera path for the page, with camera-to-world matrices by columns, degrees and seconds."""
     every = -(-len(path) // MAX_CAMERAS)
     notes = [*path.notes]
     if every > 1:
@@ -245,7 +225,7 @@ def frames_of(path: CameraPath) -> dict[str, Any]:
     return {"format": path.format, "notes": notes, "frames": frames}
 
 
-#: Files of the page, in the package's folder `page`; `INDEX` is a template.
+#: Files in the package's folder `page`; `INDEX` is a template.
 INDEX = "index.html"
 PAGE = (
     *("boot.js", "view.js", "spark.js", "scene.js", "sizes.js", "playcanvas.js", "cesium.js", "file_state.js"),
@@ -253,8 +233,8 @@ PAGE = (
     "style.css",
 )
 
-#: Settings of the page; `export` recognizes its own sites by this file.
-SETTINGS = "view.json"
+#: Name of the settings of the page, and their "generator", by which `export` recognizes its own sites.
+SETTINGS, GENERATOR = "view.json", "sparklod view"
 
 #: Path to which the page posts dropped camera paths.
 CAMERAS = "cameras"
@@ -262,13 +242,10 @@ CAMERAS = "cameras"
 #: Placeholders of the template.
 MARK = re.compile(r"\{\{([A-Z_]+)\}\}")
 
-#: Value of "generator" in `SETTINGS`.
-GENERATOR = "sparklod view"
-
 
 @dataclass(frozen=True)
 class Site:
-    """A site; `cameras` are the settings of camera paths that are dropped onto the page."""
+    """A site, with notes for the user; `cameras` are the settings of camera paths dropped onto the page."""
 
     resources: Resources
     cameras: CameraSettings
@@ -279,7 +256,7 @@ class Site:
 def site_of(
     shown: Sequence[ShownFile],
     extents: Sequence[Extent],
-    start: Start,
+    start: Mapping[str, Any],
     budget: int | None,
     path: CameraPath | None,
     libraries: Libraries,
@@ -287,11 +264,12 @@ def site_of(
     cameras: CameraSettings,
     served: bool,
 ) -> Site:
-    """Return the site of some files, of given extents.
+    """Return the site of files with their extents.
 
     Args:
-        cameras: settings of camera paths that are dropped onto the page.
-        served: by `server`, which parses camera paths; otherwise the page can read those of sparklod itself.
+        start: the first view, from `shown_files.start_of`.
+        cameras: settings of camera paths dropped onto the page.
+        served: `server` will serve the site and parse camera paths; otherwise the page reads those of sparklod only.
     """
     folder = files(__package__).joinpath("page")
     title = ", ".join(file.name for file in shown)
@@ -301,7 +279,7 @@ def site_of(
         "title": title,
         "engine": shown[0].engine,
         "files": [_file(file, extent) for file, extent in zip(shown, extents, strict=True)],
-        "start": dataclasses.asdict(start),
+        "start": start,
         "up": cameras.up_axis,
         "budget": budget,
         "path": None if path is None else frames_of(path),
@@ -311,12 +289,11 @@ def site_of(
     resources: dict[str, bytes | Path] = {
         INDEX: _index(folder.joinpath(INDEX).read_text("utf-8"), title, libraries).encode(),
         SETTINGS: json.dumps(settings, ensure_ascii=True, indent=1).encode(),
+        **{name: folder.joinpath(name).read_bytes() for name in PAGE},
+        **libraries.files,
     }
-    for name in PAGE:
-        resources[name] = folder.joinpath(name).read_bytes()
-    resources.update(libraries.files)
     for file in shown:
-        resources.update(file.files)
+        resources |= file.files
     notes = [file.note for file in shown if file.note is not None]
     if cameras.up is None:
         notes += up_notes_of((file.name, each.up, each.up_by) for file, each in zip(shown, extents, strict=True))
@@ -324,29 +301,30 @@ def site_of(
 
 
 def _file(shown: ShownFile, extent: Extent) -> dict[str, Any]:
+    chunks = None if shown.header is None else shown.header.chunks
     return {
         "name": shown.name,
         "url": shown.url,
         "format": shown.format,
-        "type": shown.spark_type,
+        "type": SPARK_TYPES.get(shown.format),
         "bytes": shown.bytes,
         "splats": extent.splats,
         "leaves": extent.leaves,
         "levels": extent.levels,
         "up": extent.up,
         "layout": extent.layout,
-        "chunks": None if shown.header is None else len(shown.header.chunks),
-        "first_bytes": None if shown.header is None else sum(entry.bytes for entry in shown.header.chunks[:1]),
+        "chunks": None if chunks is None else len(chunks),
+        "first_bytes": None if chunks is None else sum(entry.bytes for entry in chunks[:1]),
         "paged": shown.paged,
         "chunked": shown.header is not None and shown.header.chunked,
     }
 
 
 def _index(template: str, title: str, libraries: Libraries) -> str:
-    """Return the page with the addresses of its libraries, and a policy that lets it load nothing else."""
-    import_map = json.dumps(libraries.import_map(), indent=1).replace("<", "\\u003c")
-    digest = base64.b64encode(hashlib.sha256(import_map.encode()).digest()).decode()
-    scripts = ["'self'", f"'sha256-{digest}'", "'wasm-unsafe-eval'", *libraries.integrity]
+    """Fill in the template of the page: addresses of its libraries, and a policy that lets it load nothing else."""
+    import_map = json.dumps(libraries.import_map, indent=1).replace("<", "\\u003c")
+    digest = b64encode(hashlib.sha256(import_map.encode()).digest()).decode()
+    scripts = ["'self'", f"'sha256-{digest}'", "'wasm-unsafe-eval'", *libraries.import_map.get("integrity", ())]
     styles = ["'self'"]
     if LENIENT & libraries.versions.keys():
         scripts.append("'unsafe-eval'")
@@ -372,15 +350,15 @@ PARTS = ".sparklod-{}.part"
 #: Bytes copied at a time.
 PIECE = 1 << 20
 
-#: Folders, and suffixes of files, in the folder of a site; names of files may change from version to version.
+#: Folders, and suffixes of files, in an exported site; names of files depend on the version.
 FOLDERS, SUFFIXES = ("data", "lib"), (".html", ".css", ".js", ".json")
 
 
 def check_folder(folder: Path, site: Site | None = None, *, overwrite: bool) -> None:
-    """Raise an `OutputError` where a site cannot be written into a folder.
+    """Raise an `OutputError` if a site cannot be written into a folder.
 
     An existing folder is replaced only if it is empty or holds an exported site and nothing else: other files in it,
-    such as the .git of published pages, belong to the user. Files that the site shows must lie outside the folder.
+    such as the .git of published pages, belong to the user. Files of the site must lie outside the folder.
     """
     try:
         if folder.suffix.lower() in (".html", ".htm") and not folder.is_dir():
@@ -413,7 +391,7 @@ def _is_site(folder: Path) -> bool:
 
 
 def export(site: Site, folder: Path, *, overwrite: bool, progress: Progress = silent) -> int:
-    """Write a site into a folder, which appears when it is complete, and return its bytes."""
+    """Write a site into a folder, which appears when it is complete; return the bytes written."""
     check_folder(folder, site, overwrite=overwrite)
     real = folder.resolve()
     part = real.with_name(PARTS.format(secrets.token_hex(8)))
@@ -446,7 +424,7 @@ def _pieces(path: Path) -> Iterator[bytes]:
 
 
 def _replace(folder: Path, part: Path) -> None:
-    """Replace a folder by a complete one; the former one comes back where that fails."""
+    """Replace a folder by a complete one, or restore it if that fails."""
     if not folder.exists():
         part.rename(folder)
         return
