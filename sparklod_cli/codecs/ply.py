@@ -1,6 +1,6 @@
 """PLY of 3D Gaussian Splatting, as Inria's code, nerfstudio, gsplat, splat-transform and others write it.
 
-A vertex is a splat, with scalar properties in any order; notes name the properties and elements that are left out.
+A vertex is a splat, with scalar properties in any order; notes name the properties and elements that are ignored.
 PlayCanvas's compressed PLY is read, too.
 """
 
@@ -47,10 +47,10 @@ from .reader import (
 
 Coding = Callable[[FloatArray], FloatArray]
 
-#: Places of properties in a vertex.
+#: Indices of properties in a vertex.
 Places = slice | list[int]
 
-#: Columns of `Splats`, the properties that each consists of, and its decode and encode.
+#: Columns of `Splats`, the properties of each, and its decode and encode.
 COLUMNS: tuple[tuple[str, tuple[str, ...], Coding, Coding], ...] = (
     ("center", ("x", "y", "z"), np.asarray, np.asarray),
     ("rgb", ("f_dc_0", "f_dc_1", "f_dc_2"), quantize.decode_dc, quantize.encode_dc),
@@ -62,29 +62,28 @@ REQUIRED = tuple(name for _, names, _, _ in COLUMNS for name in names)
 
 SCALES = ("scale_0", "scale_1", "scale_2")
 
-#: Colours of 0 to 255 that are read where those of SH are missing, as in files of nerfstudio's --ply-color-mode rgb.
+#: Colours of 0 to 255, read if those of SH are missing, as in files of nerfstudio's --ply-color-mode rgb.
 PLAIN_RGB = ("red", "green", "blue")
 
-#: Standard deviation, in world units, of the filter with which Mip-Splatting smooths each splat when it draws it, and
-#: which is in the scales and opacities of its "fused" files already. Facts: its scene/gaussian_model.py.
+#: Standard deviation, world units, of the filter with which Mip-Splatting smooths each splat when it draws it. The
+#: scales and opacities of its "fused" files include it already. Source: its scene/gaussian_model.py.
 FILTER = "filter_3D"
 
-#: The element of Apple's SHARP whose value is 1 where colours are linear and 0 where they are sRGB.
+#: The element of Apple's SHARP whose value is 1 for linear colours and 0 for sRGB.
 COLOR_SPACE = "color_space"
 
-#: Precedes the names of properties that CloudCompare writes.
+#: Prefix of the properties that CloudCompare writes.
 PREFIX = "scalar_"
 
-#: Missing properties that an error names.
+#: Most missing properties that an error names.
 FEW = 4
 
-#: Third scale of disks (2D Gaussian Splatting), across their plane, over the smaller of their two scales: less than a
-#: pixel wherever a disk is smaller than a picture, and above 0, which formats of logarithms do not hold. Chosen.
+#: Thickness of disks (2D Gaussian Splatting) over the smaller of their two scales: less than a pixel if a disk is
+#: smaller than a picture, and above 0, whose logarithm formats do not store. Chosen.
 THIN = np.float32(1e-3)
 
-#: Values that are not numbers, as C libraries of Windows write them: "-nan(ind)", "1.#QNAN", "-1.#INF00".
+#: NaN and infinity as C libraries of Windows write them: "-nan(ind)", "1.#QNAN", "-1.#INF00".
 WINDOWS_NAN = re.compile(rb"(?<!\S)([+-]?)(?:nan\([^\s()]*\)|1[.,]#(inf)?\w*)(?!\S)", re.IGNORECASE)
-
 
 #: Largest header, bytes; that of a splat file has some 1,500.
 MAX_HEADER = 1 << 20
@@ -92,7 +91,7 @@ MAX_HEADER = 1 << 20
 #: Most digits of a count: Python refuses to convert numbers of several thousand digits.
 MAX_DIGITS = 100
 
-#: Comments of trainers in lower case, and the mode of `PlyHeader` that each means.
+#: Modes of `PlyHeader`, by the comments of trainers in lower case.
 MODES = {f"splatrendermode: {mode}".encode(): mode for mode in ("mip", "2dgs", "default")}
 MODES |= {b"antialiased 1": "mip", b"antialiased 0": "default"}
 
@@ -102,15 +101,15 @@ class PlyHeader:
     """A PLY header.
 
     Attributes:
-        elements: descriptions of the elements without their data, by name.
-        counts: numbers of their rows.
-        row_types: types of their rows, without `PREFIX` before names, in ascii files of floats alone; None if rows have
-            lists, and so no fixed size.
-        text: whether the data are ascii.
-        size: bytes of the header.
+        elements: elements without their data, by name.
+        counts: number of rows of each element.
+        row_types: type of the rows of each element, with names without `PREFIX`, and floats for all properties of ascii
+            files; None if rows have lists, and so no fixed size.
+        text: the data are ascii.
+        size: size of the header, bytes.
         note: the first comment that is a JSON object; empty without one.
-        mode: how trainers say that the splats are drawn, "mip" (with the opacity compensation of Mip-Splatting), "2dgs"
-            (as disks) or "default"; Brush's last comment "SplatRenderMode: MODE" or Postshot's "antialiased 0|1".
+        mode: how the trainer draws the splats: "mip" (with the opacity compensation of Mip-Splatting), "2dgs" (as
+            disks) or "default", from Brush's last comment "SplatRenderMode: MODE" or Postshot's "antialiased 0|1".
     """
 
     elements: dict[str, PlyElement]
@@ -125,22 +124,21 @@ class PlyHeader:
     def check_size(self, size: int) -> int:
         """Check that a file of `size` bytes can hold all rows, before memory is allocated for them.
 
-        Returns the bytes after the last row; 0 if their number is unknown.
+        Returns the number of bytes after the last row; 0 if it is unknown.
         """
-        need = self.size
+        need = self.size - int(self.text)  # the last separator of an ascii file is optional
         for name, row_type in self.row_types.items():
+            least = row_type.itemsize if row_type else 1
             if self.text:  # at least a digit and a separator for each value
-                need += self.counts[name] * 2 * max(1, len(self.elements[name].properties))
-            else:
-                need += self.counts[name] * (row_type.itemsize if row_type else 1)
-        missing = need - size - (1 if self.text else 0)  # the last separator is optional
-        if missing > 0:
-            raise TruncatedError(f"cut short: {missing:,} bytes are missing of what the header announces")
-        return 0 if self.text or None in self.row_types.values() else -missing
+                least = 2 * max(1, len(self.elements[name].properties))
+            need += self.counts[name] * least
+        if need > size:
+            raise TruncatedError(f"cut short: {need - size:,} bytes are missing of what the header announces")
+        return 0 if self.text or None in self.row_types.values() else size - need
 
 
 def read_header(file: BinaryIO) -> PlyHeader:
-    """Read a header, and leave the file behind the line end_header."""
+    """Read a header up to and including the line end_header."""
     text = line = b""
     while line.strip() != b"end_header":
         line = file.readline(MAX_HEADER)
@@ -149,8 +147,8 @@ def read_header(file: BinaryIO) -> PlyHeader:
             raise FormatError("not a PLY file")
         if not line or len(text) > MAX_HEADER:
             raise TruncatedError("the PLY header does not end")
-    # plyfile gets the header without comments, which may be in any encoding, and with counts of 0: otherwise it would
-    # read all the data, and text value by value.
+    # plyfile gets the header without comments, which may have any encoding, and with counts of 0, so that it does not
+    # read the data.
     lines, counts, note, mode = [], [], b"", "default"
     for words in map(bytes.split, text.splitlines()):
         if words[:1] == [b"element"]:
@@ -178,7 +176,7 @@ def read_header(file: BinaryIO) -> PlyHeader:
         for each in element.properties:
             plain, kind = each.name.removeprefix(PREFIX) or each.name, np.dtype(each.dtype(parsed.byte_order))
             if parsed.text and kind.itemsize < 8:
-                kind = np.dtype("<f4")  # programs write "200.0" where the header announces a whole number
+                kind = np.dtype("<f4")  # programs write "200.0" for properties of whole numbers
             fields[each.name if plain in names else plain] = kind
         has_lists = any(isinstance(each, PlyListProperty) for each in element.properties)
         row_types[element.name] = None if has_lists else np.dtype([*fields.items()])
@@ -187,7 +185,7 @@ def read_header(file: BinaryIO) -> PlyHeader:
 
 
 def offset_of(file: BinaryIO, header: PlyHeader, name: str) -> int:
-    """Return where rows of an element begin in a binary file; lists before them are read for their sizes."""
+    """Return the position of the rows of an element in a binary file; reads the lengths of all lists before them."""
     at = header.size
     for other, row_type in header.row_types.items():
         if other == name:
@@ -203,7 +201,7 @@ def offset_of(file: BinaryIO, header: PlyHeader, name: str) -> int:
 
 
 def first_value(file: BinaryIO, header: PlyHeader, name: str) -> float | None:
-    """Return the first value of an element that has rows; None in ascii files and files of lists, read row by row."""
+    """Return the first value of an element that has rows; None for ascii files and for files that have lists."""
     row_type = header.row_types[name]
     if header.text or row_type is None or None in header.row_types.values():
         return None
@@ -232,7 +230,7 @@ def _skip_row(file: BinaryIO, element: PlyElement, byte_order: str) -> None:
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open a PLY file, compressed or not. An ascii file is unpacked to `scratch`, as binary rows."""
+    """Open a PLY file, compressed or not. An ascii file is unpacked to binary rows in `OpenFile.scratch`."""
     file = source.file
     header = read_header(file)
     if any(each.name == VERTEX[0] for element in header.elements.values() for each in element.properties):
@@ -276,7 +274,7 @@ def open_content(source: OpenFile) -> Reader:
 
 
 def _notes(file: BinaryIO, header: PlyHeader, names: Collection[str], needed: Collection[str]) -> tuple[str, ...]:
-    """Return the notes on data that is read in another way than it is written, and on data that is left out."""
+    """Return notes on data that is ignored, or read in another way than its program means it."""
     notes, harmless = tuple[str, ...](), HARMLESS
     if SCALES[1] in needed and SCALES[2] not in needed:
         notes += ("its disks (2D Gaussian Splatting) are read as splats a thousandth as thick",)
@@ -294,7 +292,7 @@ def _notes(file: BinaryIO, header: PlyHeader, names: Collection[str], needed: Co
 
 
 def _columns(names: Collection[str], mode: str) -> dict[str, tuple[tuple[str, ...], Coding]]:
-    """Return the columns that vertices with these properties fill: the properties of each, and its decode.
+    """Return the properties and the decode of each column of `Splats`, for vertices with these properties.
 
     Splats with one scale are balls, which need no rotation; those with two are disks, see `THIN`.
     """
@@ -323,7 +321,12 @@ def _columns(names: Collection[str], mode: str) -> dict[str, tuple[tuple[str, ..
 # Converters write infinite logits and logarithms for an opacity of 0 or 1 and a scale of 0.
 @np.errstate(over="ignore", invalid="ignore")
 def _unpack(target: RowBuffer, places: Mapping[str, tuple[Places, Coding]], rest_places: Places, block: Rows) -> int:
-    """Fill splats from a block, by the places and the decode of each column, and the places of SH, red first."""
+    """Decode a block of vertices; return the number of the vertex after it.
+
+    Args:
+        places: places of the properties of each column, and its decode.
+        rest_places: places of the SH coefficients, all of red first.
+    """
     part, rows = block
     splats, names = target.rows(part), rows.dtype.names or ()
     if rows.flags.c_contiguous and all(rows.dtype[name] == np.float32 for name in names):
@@ -331,8 +334,7 @@ def _unpack(target: RowBuffer, places: Mapping[str, tuple[Places, Coding]], rest
     else:
         matrix = np.stack([rows[name].astype(np.float32) for name in names], axis=1)
     for name, (place, decode) in places.items():
-        values = decode(matrix[:, place])
-        out = getattr(splats, name)
+        values, out = decode(matrix[:, place]), getattr(splats, name)
         if name == "scale":
             scales = values.shape[1]
             out = out[:, :scales]
@@ -353,22 +355,22 @@ def _unpack(target: RowBuffer, places: Mapping[str, tuple[Places, Coding]], rest
 
 
 def _smooth(scale: FloatArray, opacity: FloatArray, size: FloatArray) -> None:
-    """Convolve splats with balls of a standard deviation, (N,), as `FILTER` says; their integrals stay."""
+    """Convolve splats with balls of (N,) standard deviations, see `FILTER`; the integral of each splat stays."""
     smooth = np.hypot(scale, size[:, None])
     opacity *= np.divide(scale, smooth, out=np.ones_like(smooth), where=smooth > 0).prod(axis=1)
     scale[...] = smooth
 
 
 def _places(names: Sequence[str], parts: Sequence[str]) -> Places:
-    """Return the places of parts among names: a slice if they are consecutive, since indexing with it makes no copy."""
+    """Return the indices of parts among names; as a slice, which makes no copy, if they are consecutive."""
     places = [names.index(part) for part in parts]
     first = places[0] if places else 0
-    run = slice(first, first + len(places))
-    return run if places == list(range(run.start, run.stop)) else places
+    end = first + len(places)
+    return slice(first, end) if places == list(range(first, end)) else places
 
 
 def _text_rows(file: BinaryIO, header: PlyHeader, row_type: np.dtype[Any], needed: Collection[str]) -> Iterator[Rows]:
-    """Read the vertices of an ascii file in blocks; plyfile's own reader takes value by value in Python."""
+    """Read the vertices of an ascii file in blocks; plyfile's own reader is slow, value by value in Python."""
     vertices = header.counts["vertex"]
     file.seek(header.size)
     for name, count in header.counts.items():
@@ -389,7 +391,7 @@ def _text_rows(file: BinaryIO, header: PlyHeader, row_type: np.dtype[Any], neede
 
 
 def _parsed(lines: list[bytes], row_type: np.dtype[Any], needed: Collection[str]) -> NDArray[Any]:
-    """Parse vertices; if that fails, again without properties that are not read, and with `WINDOWS_NAN`."""
+    """Parse vertices; if that fails, try again without ignored properties and with `WINDOWS_NAN` replaced."""
     load = functools.partial(np.loadtxt, dtype=row_type, ndmin=1, comments=None)
     try:
         return load(lines)
@@ -399,7 +401,7 @@ def _parsed(lines: list[bytes], row_type: np.dtype[Any], needed: Collection[str]
 
 
 def _mended(line: bytes, are_needed: Sequence[bool]) -> bytes:
-    """Return a line with 0 for each value that is not read, and nan or inf for each `WINDOWS_NAN`."""
+    """Replace ignored values of a line by 0, and each `WINDOWS_NAN` by nan or inf."""
     words = WINDOWS_NAN.sub(lambda match: match[1] + (match[2] or b"nan"), line).split()
     if len(words) != len(are_needed):
         return line
@@ -407,7 +409,7 @@ def _mended(line: bytes, are_needed: Sequence[bool]) -> bytes:
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """Return the options: PLY has no choices; raises `FormatError` if the scene is a tree, which PLY cannot hold."""
+    """Return the options unchanged, since PLY has none; raises `FormatError` for a tree, which PLY cannot store."""
     if scene.tree is not None:
         raise FormatError("PLY holds no Level-of-Detail tree")
     return options
@@ -416,10 +418,10 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """Return the bytes of a binary PLY file in the layout of Inria's trainer, piece by piece.
+    """Yield the bytes of a binary PLY file in the layout of Inria's trainer.
 
-    All numbers are finite: for opacities of 0 and 1 and scales of 0, whose logits and logarithms are infinite, those of
-    `quantize.FAR` are written, which decode to the same values.
+    All numbers are finite: `quantize.FAR` replaces infinite logits and logarithms, of opacities of 0 and 1 and scales
+    of 0, and decodes to the same values.
     """
     settled(scene, options)
     splats = scene.splats
@@ -447,15 +449,15 @@ def encode(
     yield from encode_rows(rows_of_part, len(splats), threads, progress)
 
 
-# Compressed PLY: four packed words a splat, relative to the bounds of its chunk of 256.
+# Compressed PLY: four words per splat, relative to the bounds of its chunk.
 
-#: Splats of a chunk, which share bounds.
+#: Splats per chunk.
 CHUNK_SPLATS = 256
 
 #: Properties of a splat, uint32 each.
 VERTEX = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 
-#: Properties of a chunk: the bounds of each quantity; old files have no bounds of colours.
+#: Properties of a chunk: the bounds of each quantity. Old files have no bounds of colours.
 BOUNDS = {
     "position": ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z"),
     "scale": ("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z"),  # logarithms
@@ -523,7 +525,7 @@ def _compressed_left_out(header: PlyHeader) -> tuple[str, ...]:
 
 
 def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatArray:
-    """Scale (n, 3) values 0..1 of the splats in `part` to their chunks' bounds, (chunks, 6): low and high xyz."""
+    """Map (n, 3) values 0..1 of a range of splats to the bounds of their chunks, (chunks, 6) low and high x y z."""
     if bounds is None:
         return unit
     of_chunks = bounds[part.start // CHUNK_SPLATS : -(-part.stop // CHUNK_SPLATS)]
@@ -532,8 +534,9 @@ def _within(bounds: FloatArray | None, part: slice, unit: FloatArray) -> FloatAr
     return quantize.between(unit, low, high)
 
 
-def _bounds(runs: Iterator[Rows]) -> dict[str, FloatArray | None]:
-    rows = np.concatenate([rows for _, rows in runs] or [np.empty(0)])
+def _bounds(blocks: Iterator[Rows]) -> dict[str, FloatArray | None]:
+    """Return the bounds of all chunks, (chunks, 6), by the keys of `BOUNDS`; None for missing ones."""
+    rows = np.concatenate([rows for _, rows in blocks] or [np.empty(0)])
     have = rows.dtype.names or ()
     return {
         what: np.stack([rows[name] for name in names], axis=1).astype(np.float32) if names[0] in have else None
@@ -542,7 +545,7 @@ def _bounds(runs: Iterator[Rows]) -> dict[str, FloatArray | None]:
 
 
 def _check_compressed(header: PlyHeader) -> tuple[int, int]:
-    """Check the elements, and return the number of splats and of SH coefficients per channel."""
+    """Check the elements; return the number of splats and of SH coefficients per channel."""
     if header.text:
         raise FormatError("an ascii compressed PLY, but the format is binary")
     count = header.counts.get("vertex", 0)
@@ -567,7 +570,7 @@ def _check_compressed(header: PlyHeader) -> tuple[int, int]:
 
 
 def _check_types(header: PlyHeader, element: str, names: tuple[str, ...], kind: type[np.generic]) -> tuple[str, ...]:
-    """Return the names of an element's properties, after a check that `names` are among them and of a type."""
+    """Check that an element has properties of these names, all of one type; return the names of all its properties."""
     row_type = header.row_types.get(element)
     have: tuple[str, ...] = (row_type.names or ()) if row_type else ()
     bad = [name for name in names if row_type is None or name not in have or row_type[name].newbyteorder("=") != kind]

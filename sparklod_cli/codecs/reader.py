@@ -1,4 +1,4 @@
-"""Readers of files in blocks, so that no file is in memory as a whole; notes in files; checks of their splats.
+"""Readers, which read a file in blocks and never hold all of its bytes; notes in files; checks of splats.
 
 Formats without a field for it hold a note of sparklod: a JSON object with "generator". It is the comment of a RAD, PLY
 or SPZ file, and "asset" of a SOG or a Streamed SOG, which may have more keys.
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..model.lod_tree import LodTree
-from ..model.scene import AXES, SPECIFIED, Scene
+from ..model.scene import AXES, SPECIFIED, Scene, facts_of
 from ..model.splats import COLUMNS, UNIT_TOLERANCE, Splats, describe_invalid
 from ..system.errors import FormatError, HasTreeError, InvalidSplatsError, TreeError, TruncatedError
 from ..system.progress import Progress, silent
@@ -36,23 +36,23 @@ if TYPE_CHECKING:
 #: saves.
 BLOCK_BYTES = 1 << 18
 
-#: A block of rows: which rows, and their content.
+#: A block of rows: a slice of row numbers, and the rows.
 Rows = tuple[slice, NDArray[Any]]
 
 #: Reads the next `size` bytes, or fewer at the end of the data; or `size` bytes from a position on.
 Read = Callable[[int], bytes | memoryview]
 ReadAt = Callable[[int, int], bytes | memoryview]
 
-#: Opens a file that another one names; raises `FormatError` where it cannot.
+#: Opens a file by the name that another file gives it; raises `FormatError` if that fails.
 OpenCompanion = Callable[[str], BinaryIO]
 
-#: Opens an unpacked file with these bytes, which are made at the first call, for formats whose splats do not lie one
-#: after the other. The file stays open as long as the one that is read.
+#: Opens a temporary file of unpacked data, for formats that do not store splats one after the other. The first call
+#: writes it, with the bytes that the argument generates. It stays open as long as the file that is read.
 Scratch = Callable[[Callable[[], Iterable[bytes]]], "OpenFile"]
 
 
 def size_of(file: BinaryIO) -> int:
-    """Return the bytes of a file, which is left at its beginning."""
+    """Return the size of a file, bytes, and return to its beginning."""
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
     return size
@@ -62,11 +62,11 @@ class OpenFile:
     """Open file for a codec.
 
     Attributes:
-        file: open for reading, at its beginning, until the last read.
-        size: bytes of the file.
-        open_companion: opens the files that it names; None if no other files can be opened.
-        scratch: keeps data that must be unpacked before rows can be read in any order; None to read all rows once.
-        threads: number of threads that read the files which it names.
+        file: binary file at its beginning; stays open until the last read.
+        size: size of the file, bytes.
+        open_companion: opens the files that this file names; None if no other files can be opened.
+        scratch: stores data that must be unpacked before rows can be read in any order; None if all rows are read once.
+        threads: number of threads that read the companions.
     """
 
     def __init__(
@@ -77,20 +77,19 @@ class OpenFile:
         threads: int = 1,
     ) -> None:
         self.file, self.open_companion, self.scratch, self.threads = file, open_companion, scratch, threads
-        self.size = file.seek(0, io.SEEK_END)
-        file.seek(0)
+        self.size = size_of(file)
         self._lock = threading.Lock()
         plain = isinstance(getattr(file, "raw", None), io.FileIO) and hasattr(os, "pread")
         self._descriptor = file.fileno() if plain else None
 
     def read_at(self, at: int, size: int) -> bytes:
-        """Return the `size` bytes from `at` on, or fewer at the end of the file; several threads may call this."""
+        """Read `size` bytes at a position, or fewer at the end of the file; safe to call from several threads."""
         if self._descriptor is None:
             with self._lock:
                 self.file.seek(at)
                 return self.file.read(size)
         data = os.pread(self._descriptor, size, at)
-        while 0 < len(data) < size:  # a read may give less, at most 2 GiB
+        while 0 < len(data) < size:  # one read returns at most 2 GiB
             more = os.pread(self._descriptor, size - len(data), at + len(data))
             if not more:
                 break
@@ -113,27 +112,27 @@ def rows_of(
 
 
 def encode_rows(encode: Callable[[slice], bytes], count: int, threads: int, progress: Progress) -> Iterator[bytes]:
-    """Return the bytes of `count` rows in order: `encode` is called with blocks of rows, on several threads."""
+    """Encode `count` rows in blocks, on several threads, and yield their bytes in order."""
     parts = blocks_of(count)
     for part, piece in zip(parts, ordered_map(encode, parts, threads), strict=True):
         yield piece
         progress("writing", part.stop, count, "splat")
 
 
-#: Splats of a block that a scene is read in, unless its format has other ones: some 30 MB with SH of degree 3.
+#: Splats per block of `Reader.blocks`, unless the format has blocks of its own: some 30 MB with SH of degree 3.
 BLOCK_SPLATS = 1 << 17
 
 
 @dataclass(frozen=True, eq=False)
 class RowBuffer:
-    """Rows of a file to fill.
+    """Memory that a codec fills with n rows of a file.
 
     Attributes:
-        splats: n rows.
-        start: number in the file of the first.
-        tree: (n,) nodes to fill; None in a file without a tree.
-        columns: of `Splats` to fill; a codec may fill the others, too.
-        once: these are all rows of the file and are read once, so that they need not be unpacked to `OpenFile.scratch`.
+        start: number of the first row in the file.
+        tree: (n,) nodes; None for a file without a tree.
+        columns: columns of `Splats` to fill; a codec may fill the others, too.
+        once: these are all rows of the file and are read once, so that a codec need not unpack them to
+            `OpenFile.scratch`.
     """
 
     splats: Splats
@@ -144,15 +143,22 @@ class RowBuffer:
 
     @property
     def stop(self) -> int:
-        """Number in the file of the row after the last."""
+        """Number of the row after the last one, in the file."""
         return self.start + len(self.splats)
 
     def rows(self, part: slice) -> Splats:
-        """Return views of rows, which are counted as those of the file."""
+        """Return views of a range of rows, given by their numbers in the file."""
         return self.splats.take(slice(part.start - self.start, part.stop - self.start))
 
     def shares(self, counts: Iterable[int]) -> Iterator[tuple[int, slice, Splats]]:
-        """Yield the files, of these counts one after the other, that have rows of these: number, rows and views."""
+        """Divide the buffer among files that are read one after the other.
+
+        Args:
+            counts: number of rows of each file.
+
+        Yields:
+            for each file with rows in the buffer: its index, the range of its rows, and views of them.
+        """
         end = 0
         for number, count in enumerate(counts):
             begin, end = end, end + count
@@ -161,7 +167,7 @@ class RowBuffer:
                 yield number, slice(start - begin, stop - begin), self.rows(slice(start, stop))
 
     def nodes(self, part: slice) -> LodTree | None:
-        """Return views of nodes, counted as `rows`."""
+        """Return views of a range of nodes, given by their numbers in the file; None without a tree."""
         return None if self.tree is None else self.tree.rows(slice(part.start - self.start, part.stop - self.start))
 
 
@@ -171,16 +177,16 @@ Fill = Callable[[RowBuffer, int, Progress], None]
 
 @dataclass(frozen=True, eq=False)
 class Reader:
-    """Splats of a file, or of several as one scene, whose headers have been read.
+    """Reader of the splats of a file, or of several files as one scene, after their headers have been read.
 
     Attributes:
-        count: N splats, as the header promises.
-        sh_degree: of the decoded splats.
-        format, antialiased, notes, up, up_by, chunk_bytes: as in `Scene`.
-        header: as in `Scene`; reading all splats may add to it.
-        coding: called when all splats have been read, returns `Scene.coding`; None for float32.
-        block: smallest number of splats that are read together; ranges are read in multiples of it.
-        concurrent: several threads may call `fill` at a time.
+        count: number of splats according to the header.
+        sh_degree: SH degree of the decoded splats.
+        format, antialiased, notes, up, up_by, chunk_bytes: see `Scene`.
+        header: see `Scene`; reading all splats may add entries.
+        coding: returns `Scene.coding` once all splats have been read; None for float32.
+        block: smallest number of splats that are read together; `blocks` reads multiples of it.
+        concurrent: `fill` can be called from several threads at a time.
     """
 
     count: int
@@ -211,10 +217,7 @@ class Reader:
         *,
         once: bool = False,
     ) -> tuple[Splats, LodTree | None]:
-        """Read a range of splats, and their nodes in a file with a tree; other columns may be 0.
-
-        `once` is that of `RowBuffer`.
-        """
+        """Read columns of a range of splats, and the nodes if the file has a tree; `once` is that of `RowBuffer`."""
         splats, tree = Splats.zeros(stop - start, self.sh_degree), None
         if self.has_tree:
             tree = LodTree(np.empty(stop - start, np.uint16), np.empty(stop - start, np.uint32))
@@ -222,12 +225,11 @@ class Reader:
         return splats, tree
 
     def scene(self, *, columns: Collection[str] = COLUMNS, progress: Progress = silent, validate: bool = True) -> Scene:
-        """Read all splats, once; `validate` refuses a broken tree, and gives leaves a `child_start` of 0."""
+        """Read the whole scene; `validate` refuses a broken tree, and sets the `child_start` of leaves to 0."""
         splats, tree = self.read(0, self.count, columns, progress, once=True)
         coding = None if self.coding is None else self.coding()
-        facts = self.antialiased, self.format, self.notes, self.header, self.chunk_bytes, coding, self.up, self.up_by
-        scene = Scene(splats, tree, *facts)
-        tree = scene.tree  # which knows that it is valid once it has been validated
+        scene = Scene(splats, tree, chunk_bytes=self.chunk_bytes, coding=coding, **facts_of(self))
+        tree = scene.tree  # the scene's own copy, which remembers that it was validated
         if tree is None or not validate:
             return scene
         try:
@@ -239,7 +241,7 @@ class Reader:
         return scene if is_same else dataclasses.replace(scene, tree=LodTree(tree.child_count, start))
 
     def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[Splats]:
-        """Read a range of splats, all by default, in blocks; raises as `check_plain` and `read`."""
+        """Read a range of splats, all by default, in blocks; raises the errors of `check_plain` and `read`."""
         self.check_plain()
         stop = self.count if stop is None else stop
         step = self.block * max(1, BLOCK_SPLATS // self.block)
@@ -263,28 +265,28 @@ def decode_file(
     progress: Progress = silent,
     **more: Any,
 ) -> Scene:
-    """Read a whole scene from an open file by the module of its format; `more` is passed on to `Reader.scene`."""
+    """Read a whole scene from an open file with the module of its format; `more` is passed on to `Reader.scene`."""
     reader: Reader = codec.open_content(OpenFile(file, open_companion, threads=threads))
     return dataclasses.replace(reader, threads=threads).scene(progress=progress, **more)
 
 
-#: Names, or families of them, in a note, and characters of each at most: the file chooses both. Chosen.
+#: Most names, or runs of them, in a note, and most characters of each, since the file chooses both. Chosen.
 MOST_NAMED, MOST_NAME = 8, 40
 
-#: Properties that say nothing of a splat: normals, colours for viewers of point clouds, the state of an editor.
+#: Properties that do not matter for splats: normals, colours for viewers of point clouds, the state of an editor.
 HARMLESS = {"nx", "ny", "nz", "normal_x", "normal_y", "normal_z", "normals", "red", "green", "blue", "alpha", "state"}
 
-#: Members of a family, names that count up, from which its first and last name stand for all.
-FAMILY = 3
+#: Fewest names of a run, which count up one by one, that are abbreviated to the first and the last.
+LEAST_RUN = 3
 
-#: A name with a number at its end, of few enough digits to count with.
+#: A name that ends in a number of at most 9 digits.
 _COUNTED = re.compile(r"(.*?)(0|[1-9][0-9]{0,8})", re.DOTALL)
 
 
 class Note(str):
-    """A note on a scene, with the code of the finding that `inspect` makes of it; None for no finding.
+    """A note on a scene, with the code under which `inspect` reports it; None if `inspect` does not.
 
-    A plain text is a note on data that the reader leaves out.
+    A plain str is a note on data that the reader leaves out.
     """
 
     code: str | None
@@ -296,37 +298,37 @@ class Note(str):
 
 
 def code_of(note: str) -> str | None:
-    """Return the code of the finding that a note is; None for no finding."""
+    """Return the code under which `inspect` reports a note; None if it does not."""
     return note.code if isinstance(note, Note) else "container.left-out"
 
 
 def left_out(noun: str, plural: str, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the note that names data, such as "its properties label and motion_0 to motion_8 are left out"."""
+    """Return a note on ignored data, such as "its properties label and motion_0 to motion_8 are left out", if any."""
     every = sorted(set(names), key=_counted)
     if not every:
         return ()
-    shown = list(_families(every))
+    shown = list(_runs(every))
     more = len(shown) - MOST_NAMED
     shown = [*shown[:MOST_NAMED], f"{more:,} more"] if more > 0 else shown
     text = " and ".join(filter(None, (", ".join(shown[:-1]), shown[-1])))
     return (f"its {noun} {text} is left out" if len(every) == 1 else f"its {plural} {text} are left out",)
 
 
-def _families(names: list[str]) -> Iterator[str]:
-    """Yield the names, and the first and the last of runs of names that count up one by one."""
+def _runs(names: list[str]) -> Iterator[str]:
+    """Yield names, with runs of names that count up one by one abbreviated, such as "motion_0 to motion_8"."""
     run: list[str] = []
-    for name in [*names, ""]:  # which ends the last run
+    for name in [*names, ""]:  # the empty name ends the last run
         start, number = _counted(name)
         if run and number >= 0 and _counted(run[-1]) == (start, number - 1):
             run.append(name)
             continue
         ends = [printable(each, MOST_NAME) for each in run]
-        yield from ends if len(run) < FAMILY else [f"{ends[0]} to {ends[-1]}"]
+        yield from ends if len(run) < LEAST_RUN else [f"{ends[0]} to {ends[-1]}"]
         run = [name]
 
 
 def _counted(name: str) -> tuple[str, int]:
-    """Return a name without the number at its end, and that number; -1 without one."""
+    """Split a name into text and the number at its end; -1 without a number."""
     match = _COUNTED.fullmatch(name)
     return (match[1], int(match[2])) if match else (name, -1)
 
@@ -337,7 +339,7 @@ GENERATOR = "sparklod "
 
 @dataclass(frozen=True)
 class FileNote:
-    """Contents of the note in a file; `is_ours` if sparklod wrote it; `problems` are notes on invalid values."""
+    """Contents of the note in a file: `is_ours` if sparklod wrote it, `problems` are messages about invalid values."""
 
     antialiased: bool = False
     up: str | None = None
@@ -345,25 +347,25 @@ class FileNote:
     is_ours: bool = False
 
     def axis_of(self, form: str) -> tuple[str | None, str]:
-        """Return `up` and `up_by` of a file: its note, or what `SPECIFIED` says if another program wrote it."""
+        """Return `up` and `up_by` of a file: from its note, or from `SPECIFIED` if another program wrote it."""
         if self.up is None and not self.is_ours:
             return SPECIFIED[form], form
         return self.up, ""
 
 
 def note_of(*, antialiased: bool = False, up: str | None = None) -> dict[str, Any]:
-    """Return the note of a file: "generator", "antialiased" where that is true, and "up" where it is known."""
+    """Return the note for a new file: "generator", "antialiased" if that is true, and "up" if it is known."""
     note: dict[str, Any] = {"generator": GENERATOR + __version__}
     return note | ({"antialiased": True} if antialiased else {}) | ({} if up is None else {"up": up})
 
 
 def comment_of(*, antialiased: bool = False, up: str | None = None) -> str:
-    """Return the note of a file as one line of ASCII."""
+    """Return the note for a new file as one line of ASCII."""
     return json.dumps(note_of(antialiased=antialiased, up=up))
 
 
 def read_note(note: Any) -> FileNote:
-    """Parse a note; one that is not of sparklod says nothing."""
+    """Parse the note in a file; notes of other programs are ignored."""
     if not isinstance(note, dict) or not str(note.get("generator", "")).startswith(GENERATOR):
         return FileNote()
     up, problems = note.get("up"), tuple[str, ...]()
@@ -374,34 +376,31 @@ def read_note(note: Any) -> FileNote:
 
 
 def read_comment(comment: str | bytes | None) -> FileNote:
-    """Parse a comment; free text says nothing."""
-    if not comment:
-        return FileNote()
+    """Parse the comment of a file as a note; free text is ignored."""
     try:
-        return read_note(parse_json(comment))
+        return read_note(parse_json(comment or b"{}"))
     except ValueError:
         return FileNote()
 
 
 def is_valid_and_visible(splats: Splats, threads: int) -> tuple[bool, bool]:
-    """Return whether all splats are certainly valid, and visible; otherwise `Splats.invalid` and `Selection` decide.
+    """Return whether all splats are valid, and whether all are visible, by a fast test.
 
-    Rounding differs from theirs, so a rotation has to be nearer to a unit one.
+    False only means that `Splats.invalid` and `Selection` must decide: their rounding differs, so this test accepts
+    quaternions within half the tolerance only.
     """
     from ..model.selection import EXAMINED
 
     tolerance = np.float32(UNIT_TOLERANCE / 2)
 
     def counts(part: slice) -> tuple[int, int]:
-        columns = (getattr(splats, name)[part].reshape(-1) for name in COLUMNS)
-        doubtful, invisible = count_doubtful(*columns, tolerance)
-        return int(doubtful), int(invisible)
+        return count_doubtful(*(getattr(splats, name)[part].reshape(-1) for name in COLUMNS), tolerance)
 
     tallies = list(ordered_map(counts, blocks_of(len(splats), EXAMINED), threads))
     return not any(doubtful for doubtful, _ in tallies), not any(invisible for _, invisible in tallies)
 
 
 def check_valid(splats: Splats, threads: int) -> None:
-    """Check splats where they enter: from a file or from the API; `InvalidSplatsError` if one is invalid."""
+    """Raise `InvalidSplatsError` if a splat of an input is invalid."""
     if not is_valid_and_visible(splats, threads)[0] and (invalid := splats.invalid()):
         raise InvalidSplatsError(f"{describe_invalid(invalid)}; such splats are not written, leave them out")

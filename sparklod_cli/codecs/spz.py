@@ -1,11 +1,10 @@
 """SPZ, Niantic's compressed splats, and Spark's extension of it for Level-of-Detail trees.
 
-Versions 1 to 3 are a header and streams in a gzip member, version 4 a plain header and a zstd frame for each stream.
-Extension records, of which the coordinate system is read and written, follow the streams, in version 4 the header. A
-record has its type, the bytes of its payload, and the payload.
+Versions 1 to 3 are one gzip member with a header and streams, version 4 a plain header and a zstd frame per stream.
+Extension records follow the streams, in version 4 the header; the coordinate system is read and written.
 
 All versions are read. Versions 2 and 3 are written, and 4 without a tree, for which Spark's extension is not defined.
-`docs/formats/spz.md` lays the extension out byte by byte.
+`docs/formats/spz.md` documents the extension byte by byte.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from .compression import Inflate, Unzstd
 from .encoder import CLAMPED, SPZ_RANGES, CodeRange, Encoded, Windows, results, tally, windows_of
 from .formats import DEFAULT_SPZ_VERSION, DEFAULTS, MAX_FRACTIONAL_BITS, TREE_SPZ_VERSIONS, WriteOptions
 from .quantize import ALL_BITS, Bytes
-from .reader import FileNote, OpenFile, Read, Reader, RowBuffer, Scratch, comment_of, read_comment, rows_of
+from .reader import FileNote, OpenFile, Read, Reader, RowBuffer, comment_of, read_comment, rows_of
 from .statistics import Statistics, enough, fine_bits
 
 MAGIC = 0x5053474E  # "NGSP"
@@ -50,13 +49,9 @@ KNOWN_FLAGS = ANTIALIASED | EXTENSIONS | LOD
 
 
 class SpzStream(NamedTuple):
-    """One stream of a file: one column of all splats in order.
+    """One stream of a file: a column of `Splats` or `LodTree`, `size` bytes per splat.
 
-    Attributes:
-        size: bytes per splat.
-        column: of `Splats` or `LodTree`.
-        decode: (n, size) bytes to n rows of the column, of any shape.
-        encode: n rows of the column to bytes.
+    `decode` turns (n, size) bytes into n rows of the column, in any shape; `encode` turns rows into bytes.
     """
 
     name: str
@@ -64,6 +59,11 @@ class SpzStream(NamedTuple):
     column: str
     decode: Callable[[quantize.Bytes], NDArray[Any]]
     encode: Callable[[NDArray[Any]], NDArray[Any]]
+
+    @property
+    def row_type(self) -> np.dtype[Any]:
+        """Type of the bytes of a splat."""
+        return np.dtype((np.uint8, (self.size,)))
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Layout:
         return self.count * sum(stream.size for stream in self.streams())
 
 
-#: Some rows of a stream: the stream, which rows, and (n, size) bytes.
+#: A block of rows of a stream: the stream, a slice of row numbers, and (n, size) bytes.
 StreamRows = tuple[SpzStream, slice, Bytes]
 
 #: Versions that are read.
@@ -134,8 +134,8 @@ READABLE = (1, 2, 3, 4)
 def open_content(source: OpenFile) -> Reader:
     """Open a file of any version, with a tree or without.
 
-    The header of its scene has the fields of `Layout`, the reserved byte and, once all is read, the number of bytes
-    after the data.
+    The header of its scene has the fields of `Layout`, the reserved byte and, after all splats have been read, the
+    number of bytes behind the data.
 
     Raises:
         FormatError: the file is not SPZ, of an unknown version or SH degree, cut short or corrupt, or announces far
@@ -152,10 +152,11 @@ def open_content(source: OpenFile) -> Reader:
                 out[...] = stream.decode(codes).reshape(out.shape)
             return codes.size
 
-        requested, done = rows, 0
+        blocks, done = rows, 0
         if source.scratch is not None and not target.once:
-            requested = _unpacked_rows(source.scratch, layout, rows, target)
-        for count in ordered_map(decode, requested, threads):
+            unpacked = source.scratch(lambda: (codes.tobytes() for _, _, codes in rows))
+            blocks = _unpacked_rows(layout, unpacked, target)
+        for count in ordered_map(decode, blocks, threads):
             done += count
             progress("reading", done, layout.total, "B")
 
@@ -182,36 +183,28 @@ def open_content(source: OpenFile) -> Reader:
     )
 
 
-def _unpacked_rows(
-    scratch: Scratch, layout: Layout, rows: Iterator[StreamRows], target: RowBuffer
-) -> Iterator[StreamRows]:
-    """Yield the rows of a target from a scratch file of all streams, which is made first if it does not exist."""
-    file, offset = scratch(lambda: (codes.tobytes() for _, _, codes in rows)), 0
+def _rows(stream: SpzStream, read: Read, count: int) -> Iterator[StreamRows]:
+    """Read all rows of a stream in order."""
+    for part, codes in rows_of(lambda at, size: read(size), 0, stream.row_type, 0, count, count, stream.name):
+        yield stream, part, codes
+
+
+def _unpacked_rows(layout: Layout, file: OpenFile, target: RowBuffer) -> Iterator[StreamRows]:
+    """Read the rows of a target from all streams, which lie one after the other in a file."""
+    offset, span = 0, (target.start, target.stop, layout.count)
     for stream in layout.streams():
-        row_type = np.dtype((np.uint8, (stream.size,)))
-        for part, codes in rows_of(
-            file.read_at, offset, row_type, target.start, target.stop, layout.count, stream.name
-        ):
+        for part, codes in rows_of(file.read_at, offset, stream.row_type, *span, stream.name):
             yield stream, part, codes
         offset += stream.size * layout.count
 
 
-def _rows(stream: SpzStream, read: Read, count: int) -> Iterator[StreamRows]:
-    """Read all rows of a stream, one after the other."""
-    row_type = np.dtype((np.uint8, (stream.size,)))
-    for part, codes in rows_of(lambda at, size: read(size), 0, row_type, 0, count, count, stream.name):
-        yield stream, part, codes
+#: An open file: its layout; the rows of its streams, which can be read once; its header, to which reading them adds;
+#: its note; and its extensions.
+OpenStreams = tuple[Layout, Iterator[StreamRows], dict[str, int], FileNote, "Extensions"]
 
 
-def open_streams(
-    file: BinaryIO, size: int
-) -> tuple[Layout, Iterator[StreamRows], dict[str, int], FileNote, Extensions]:
-    """Open a file of `size` bytes, see `open_content`.
-
-    Returns:
-        its layout; the rows of its streams, which can be read once; its header, to which reading them adds; its note;
-        and its extensions.
-    """
+def open_streams(file: BinaryIO, size: int) -> OpenStreams:
+    """Open a file of `size` bytes; raises the errors of `open_content`."""
     if file.read(4) == struct.pack("<I", MAGIC):
         file.seek(0)
         return _open_v4(file, size)
@@ -226,7 +219,7 @@ def open_streams(
         raise NotSplatsError("a gzip file, but not of SPZ")
     layout, extensions = Layout(*fields), NO_EXTENSIONS
     header = _checked(layout, size) | {"reserved": reserved}
-    if layout.flags & EXTENSIONS:  # they follow the streams, which are read again
+    if layout.flags & EXTENSIONS:  # extensions follow the streams, which are then read a second time
         extensions = _extensions_behind(inflate, layout)
         file.seek(0)
         inflate = Inflate(file)
@@ -242,7 +235,7 @@ def open_streams(
                     f"{error}; its data continue in a second gzip member, which Spark does not read"
                 ) from None
             raise
-        if layout.flags & EXTENSIONS:  # the end of the member is not searched for
+        if layout.flags & EXTENSIONS:  # they would have to be read to find the end of the member
             return
         inflate.finish()
         assert inflate.end is not None
@@ -253,7 +246,7 @@ def open_streams(
 
 
 def _checked(layout: Layout, file_size: int) -> dict[str, int]:
-    """Check that a layout can be read and that the file is large enough for it; return its fields for the header."""
+    """Check that a layout is supported and that the file is large enough for it; return its header fields."""
     if layout.version not in READABLE:
         raise VersionError(f"SPZ version {layout.version} is unknown, only 1 to 4 are read")
     if layout.sh_degree > (4 if layout.version == 4 else MAX_SH_DEGREE):
@@ -265,7 +258,7 @@ def _checked(layout: Layout, file_size: int) -> dict[str, int]:
 
 
 def _extensions_behind(inflate: Inflate, layout: Layout) -> Extensions:
-    """Return the extensions behind the streams; none where the streams are cut short, which reading these reports."""
+    """Read the extensions behind the streams; none if the streams are cut short, which their reader reports."""
     left = layout.total
     while left:
         piece = inflate.read(min(left, MOST_EXTENSION_BYTES))
@@ -276,7 +269,7 @@ def _extensions_behind(inflate: Inflate, layout: Layout) -> Extensions:
     return read_extensions(data, len(data))
 
 
-def _open_v4(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows], dict[str, int], FileNote, Extensions]:
+def _open_v4(file: BinaryIO, size: int) -> OpenStreams:
     head = file.read(HEADER_V4.size)
     if len(head) < HEADER_V4.size:
         raise TruncatedError("cut short inside the SPZ header")
@@ -309,7 +302,6 @@ def _open_v4(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows], d
             raise TruncatedError(f"cut short inside stream {stream.name}")
 
     def rows() -> Iterator[StreamRows]:
-
         for stream, (packed, _) in zip(expected, sizes, strict=False):
             end = file.tell() + packed
             unzstd = Unzstd(file, packed, stream.name)
@@ -321,53 +313,42 @@ def _open_v4(file: BinaryIO, size: int) -> tuple[Layout, Iterator[StreamRows], d
     return layout, rows(), header, FileNote(), extensions
 
 
-# Extension records: the coordinate system is read and written, others are named.
+# Extension records.
 
-#: Type of an extension record, and bytes of its payload.
+#: Header of an extension record: its type, and the size of its payload, bytes.
 RECORD = struct.Struct("<II")
 
-#: Record of the coordinate system of a file: a uint32, an index of `SYSTEMS` from 1 on.
+#: Type of the record of the coordinate system. Its payload is a uint32, the index in `SYSTEMS` plus 1.
 COORDINATE_SYSTEM = 0xADBE0003
 
-#: The coordinate systems: where x, y and z point, of left or right, down or up, back or front.
+#: The coordinate systems: the directions of x, y and z, each left or right, down or up, back or front.
 SYSTEMS = (
     *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
 )
 
-#: By the axis that points up, the right-handed system whose x points right. None has x pointing up.
+#: The right-handed system whose x points right, by the axis that points up. No such system has x pointing up.
 SYSTEM_OF_UP = {"y": "RUB", "-y": "RDF", "z": "RFU", "-z": "RBD"}
 
-#: Names of the other types that are published.
+#: Names of the other published types.
 TYPES = {0xADBE0002: "SPZ_ADOBE_safe_orbit_camera"}
 
 _DIRECTIONS = {"R": (1, 0, 0), "L": (-1, 0, 0), "U": (0, 1, 0), "D": (0, -1, 0), "B": (0, 0, 1), "F": (0, 0, -1)}
 
-#: Bytes of extension records that are read of a file.
+#: Most bytes of extension records that are read.
 MOST_EXTENSION_BYTES = 1 << 20
 
-#: Kinds of unknown records that are named.
+#: Most types of unknown records that notes name.
 MOST_NAMED = 8
 
-#: Contents of the extension records of a file: the axis that points up, by the coordinate system; what is left out, as
-#: sentences for `Scene.notes`; and whether there is a coordinate system, be it an unknown one.
+#: Contents of the extension records of a file: the axis that points up, from the coordinate system; notes on ignored
+#: records; and whether there is a coordinate system, known or unknown.
 Extensions = tuple[str | None, tuple[str, ...], bool]
 NO_EXTENSIONS: Extensions = (None, (), False)
 
 
-def extensions_of(up: str | None) -> bytes:
-    """Return the extension records of a file in which this axis points up, one of `SYSTEM_OF_UP`; b"" for None."""
-    if up is None:
-        return b""
-    number = SYSTEMS.index(SYSTEM_OF_UP[up]) + 1
-    return RECORD.pack(COORDINATE_SYSTEM, 4) + number.to_bytes(4, "little")
-
-
 def read_extensions(data: bytes, size: int) -> Extensions:
-    """Parse extension records; unknown ones are skipped, and broken ones are noted.
-
-    `data` are the records, `size` bytes together, or their first `MOST_EXTENSION_BYTES`.
-    """
+    """Parse extension records, `size` bytes or the first `MOST_EXTENSION_BYTES` of them; notes name unknown ones."""
     at, up, notes, unknown, has_system = 0, None, list[str](), dict[str, int](), False
     while at + RECORD.size <= len(data):
         kind, length = RECORD.unpack_from(data, at)
@@ -400,84 +381,76 @@ def read_extensions(data: bytes, size: int) -> Extensions:
 
 # Writing.
 
-#: The largest code that a coordinate is given, 2 ** 23 - 2. Writers clamp what does not fit to the code after it, of
-#: either sign, so `inspect` takes a coordinate that has that one for clamped.
+#: The largest code of a coordinate, 2 ** 23 - 2. Other writers clamp larger coordinates to the next code, so `inspect`
+#: reports coordinates with that code, of either sign, as clamped.
 LAST_CODE = quantize.FIXED24_MAX - 1
 
 
 def largest_fractional_bits(largest: float) -> int:
-    """Return the most fractional bits, 0 to 24, with which 24-bit fixed point holds this magnitude of a coordinate.
+    """Return the most fractional bits, 0 to 24, with which 24-bit fixed point holds coordinates of this magnitude.
 
     Raises `FormatError` if not even whole units fit.
     """
     if np.rint(largest) > LAST_CODE:
         reach = f"{largest:.0f}" if largest < 1e7 else f"{largest:.3g}"
         raise FormatError(f"coordinates reach {reach}, SPZ holds at most {LAST_CODE}: scale the scene down")
-    bits = MAX_FRACTIONAL_BITS
-    while bits and np.rint(largest * 2.0**bits) > LAST_CODE:
-        bits -= 1
-    return bits
+    return next(bits for bits in range(MAX_FRACTIONAL_BITS, -1, -1) if np.rint(largest * 2.0**bits) <= LAST_CODE)
 
 
 def needed(options: WriteOptions) -> frozenset[str]:
-    """Return the statistics by which `settled` settles these options."""
-    needed = {"reach"}
-    if options.fractional_bits is None:
-        needed.add("leaf_scale")
-    if options.sh_bits is None:
-        needed.add("leaf_sh")
-    return frozenset(needed)
+    """Return the names of the statistics from which `settled` derives the options that are None."""
+    chosen = {"reach": None, "leaf_scale": options.fractional_bits, "leaf_sh": options.sh_bits}
+    return frozenset(name for name, value in chosen.items() if value is None)
 
 
 def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
-    """Return the options with nothing left open: `encode` writes the scene with them.
+    """Return the options with a value for each that is None, chosen for the scene.
 
-    Positions get as many fractional bits as all nodes allow, up to where a step is far below the smallest splats of
-    full detail (`statistics.STEPS_A_SPLAT`): merged splats are larger. SH get as many bits as colours need (`enough`).
+    Positions get as many fractional bits as all nodes allow, but no more than make a step small for the smallest leaves
+    (`statistics.STEPS_A_SPLAT`); merged splats are larger. SH get as many bits as colours need (`enough`).
 
     Raises:
-        FormatError: a coordinate does not fit the fractional bits; the text names the most that would. Version 4 was
+        FormatError: a coordinate does not fit the fractional bits; the message says how many would. Version 4 was
             chosen for a tree, or for a scene in which x points up.
-        ValueError: there are no such bits.
+        ValueError: `sh_bits` is out of range.
     """
     version = DEFAULT_SPZ_VERSION if options.spz_version is None else options.spz_version
     if version not in TREE_SPZ_VERSIONS:
-        if not isinstance(scene, Scene) or scene.tree is not None:  # statistics are those of a tree
+        if not isinstance(scene, Scene) or scene.tree is not None:  # only trees are given as statistics
             raise FormatError("SPZ version 4 holds no tree that Spark reads; use version 2 or 3, or RAD")
         if scene.up is not None and scene.up not in SYSTEM_OF_UP:
             raise FormatError(f"SPZ version 4 cannot note that {scene.up} points up; use version 3, or turn the scene")
-    found = Statistics.of_scene(scene, needed(options)) if isinstance(scene, Scene) else scene
-    assert found.reach is not None
-    bits, most = options.fractional_bits, largest_fractional_bits(found.reach)
+    counts = Statistics.of_scene(scene, needed(options)) if isinstance(scene, Scene) else scene
+    assert counts.reach is not None
+    bits, most = options.fractional_bits, largest_fractional_bits(counts.reach)
     if bits is None:
-        bits = max(0, min(most, fine_bits(found.values["leaf_scale"])))
+        bits = max(0, min(most, fine_bits(counts.values["leaf_scale"])))
     if bits > most:
         raise FormatError(f"a coordinate does not fit {bits} fractional bits; use at most {most}")
     sh_bits = options.sh_bits
     if sh_bits is None:
-        sh_bits = quantize.LEAST_SH_BITS if found.leaf_sh is None else enough(found.leaf_sh, found.sh_between)
+        sh_bits = quantize.LEAST_SH_BITS if counts.leaf_sh is None else enough(counts.leaf_sh, counts.sh_between)
     if not quantize.LEAST_SH_BITS <= sh_bits <= ALL_BITS:
         raise ValueError(f"sh_bits is {sh_bits}, not {quantize.LEAST_SH_BITS} to {ALL_BITS}")
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits, sh_bits=sh_bits)
 
 
 def like(header: Mapping[str, int], options: WriteOptions) -> WriteOptions:
-    """Return the options, and where they leave a choice open, that of the SPZ file which a scene was read from.
+    """Set the version and the fractional bits, if they are None, to those of the SPZ file that a scene was read from.
 
-    Its values then stay as they are. Version 1 becomes 3, and so does 4, which fewer viewers read; a scene from another
-    format, by its `Scene.header`, leaves the choice open.
+    Its coordinates then stay as they are. Versions 1 and 4, which fewer viewers read, become 3. Options for a scene
+    from another format, according to its `Scene.header`, are returned unchanged.
     """
-    version, bits = options.spz_version, options.fractional_bits
     if "fractional_bits" not in header:
         return options
+    version, bits = options.spz_version, options.fractional_bits
     if version is None:
-        version = int(header["version"])
-        version = version if version in TREE_SPZ_VERSIONS else max(TREE_SPZ_VERSIONS)
-    bits = int(header["fractional_bits"]) if bits is None else bits
+        version = header["version"] if header["version"] in TREE_SPZ_VERSIONS else max(TREE_SPZ_VERSIONS)
+    bits = header["fractional_bits"] if bits is None else bits
     return dataclasses.replace(options, spz_version=version, fractional_bits=bits)
 
 
-#: How streams are deflated; the others have repetitions of all kinds.
+#: Ways to deflate streams; other streams have repetitions of all kinds.
 WAYS = {
     **dict.fromkeys(("alphas", "scales", "rotations"), compression.NOISE),
     "colors": compression.TRIPLES,
@@ -488,13 +461,12 @@ WAYS = {
 
 @dataclass(frozen=True, eq=False)
 class SpzEncoder:
-    """`encoder.Encoder` of a file: the result of a window has its part of each stream, by its name.
+    """`encoder.Encoder` of a file. The result of a window is its part of each stream, by the name of the stream.
 
     Attributes:
-        up: the axis that points up; None where it is unknown.
-        stored: (N, bytes or more) codes of streams by name, see `unchanged`. Of SH, there may be more coefficients than
-            are written.
-        unchanged: (N,) nodes that get their codes of `stored`; None for none.
+        up: the axis that points up; None if it is unknown.
+        stored: (N, bytes) codes of streams in another file, by name. There may be more SH than are written.
+        unchanged: (N,) nodes whose codes are copied from `stored`; None if all nodes are encoded.
     """
 
     layout: Layout
@@ -505,21 +477,20 @@ class SpzEncoder:
     unchanged: NDArray[np.bool_] | None = None
 
     def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
-        """Encode a window, wherever it begins."""
+        """Encode a window of nodes that begins at node `start`."""
         streams, bits, sh_bits = self.layout.streams(), self.layout.fractional_bits, self.options.sh_bits
         codes = {stream.name: np.empty((len(splats), stream.size), np.uint8) for stream in streams}
         assert sh_bits is not None
         for part in blocks_of(len(splats)):
-            some, links = splats.take(part), None if tree is None else tree.rows(part)
-            is_leaf = None if links is None else links.is_leaf
+            block, links = splats.take(part), None if tree is None else tree.rows(part)
             if self.options.covering:
-                opacity = quantize.compensated(some.opacity, some.scale, None, 2.0**-bits)
-                some = dataclasses.replace(some, opacity=opacity)
+                opacity = quantize.compensated(block.opacity, block.scale, None, 2.0**-bits)
+                block = dataclasses.replace(block, opacity=opacity)
             for stream in streams:
                 if stream.name == "sh":
-                    values = sh_codes(some.sh, is_leaf, sh_bits)
+                    values = sh_codes(block.sh, None if links is None else links.is_leaf, sh_bits)
                 else:
-                    column = getattr(some if stream.column in COLUMNS else links, stream.column)
+                    column = getattr(block if stream.column in COLUMNS else links, stream.column)
                     values = np.ascontiguousarray(stream.encode(column))
                 codes[stream.name][part] = values.view(np.uint8).reshape(-1, stream.size)
         if self.unchanged is not None:
@@ -529,11 +500,10 @@ class SpzEncoder:
                 codes[name][unchanged] = stored[here][unchanged, : codes[name].shape[1]]
         if not self.ranges:
             return codes
-
         return codes | {CLAMPED: tally(splats, self.ranges, None if tree is None else tree.is_leaf)}
 
     def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
-        """Return the header and all streams, piece by piece: as one gzip member, or those of version 4."""
+        """Yield the bytes of the file: a gzip member of the header and all streams, or those of version 4."""
         layout, streams, count = self.layout, self.layout.streams(), self.layout.count
         if layout.version not in TREE_SPZ_VERSIONS:
             yield from self._pieces_v4(windows, threads, progress)
@@ -543,7 +513,7 @@ class SpzEncoder:
         data = (windows(number, stream.name) for stream in streams for number in numbers)
         runs = [(stream.size * count, WAYS.get(stream.name, compression.MIXED)) for stream in streams]
         runs[0] = runs[0][0] + HEADER.size, runs[0][1]
-        # A plain file without it would be one of another program, whose y is up.
+        # Without the comment, a plain file would be taken for one of another program, with y up.
         comment = "" if self.up is None and layout.flags & LOD else comment_of(up=self.up)
         yield from compression.gzip_member(
             itertools.chain([HEADER.pack(MAGIC, *fields)], data),
@@ -555,7 +525,7 @@ class SpzEncoder:
         )
 
     def _pieces_v4(self, windows: Windows, threads: int, progress: Progress) -> Iterator[bytes]:
-        """Return the header, the extensions, the table of streams, and the streams, which are compressed before."""
+        """Compress all streams; yield the header, the extensions, the table of streams, and the streams."""
         layout, streams, frames = self.layout, self.layout.streams(), list[bytes]()
 
         def packed(stream: SpzStream) -> bytes:
@@ -566,7 +536,10 @@ class SpzEncoder:
         for frame in ordered_map(packed, streams, threads):
             frames.append(frame)
             progress("writing", sum(sizes[: len(frames)]), layout.total, "B")
-        extensions = extensions_of(self.up)
+        extensions = b""
+        if self.up is not None:
+            number = SYSTEMS.index(SYSTEM_OF_UP[self.up]) + 1
+            extensions = RECORD.pack(COORDINATE_SYSTEM, 4) + number.to_bytes(4, "little")
         flags = layout.flags | EXTENSIONS * bool(extensions)
         fields = layout.version, layout.count, layout.sh_degree, layout.fractional_bits, flags, len(streams)
         yield HEADER_V4.pack(MAGIC, *fields, HEADER_V4.size + len(extensions), b"") + extensions
@@ -574,7 +547,7 @@ class SpzEncoder:
         yield from frames
 
     def keeping(self, stored: StoredCodes, unchanged: NDArray[np.bool_]) -> SpzEncoder:
-        """Return an encoder that gives unchanged nodes their codes of a file, where the coding is the same."""
+        """Return an encoder that copies the codes of unchanged nodes from a file, for streams of the same coding."""
         (layout, codes), kept = stored, {}
         for stream in self.layout.streams():
             is_alike = stream.column in COLUMNS
@@ -597,9 +570,9 @@ def encoder(
     threads: int = 1,
     progress: Progress = silent,
 ) -> SpzEncoder:
-    """Return the encoder of a scene, of which nothing is read; raises ValueError unless the options are settled.
+    """Return the encoder of a scene, whose splats are not read; raises ValueError unless the options are settled.
 
-    With `counting`, it counts the values that it clamps.
+    With `counting`, the encoder counts the values that it clamps.
     """
     if options.spz_version is None or options.fractional_bits is None or options.sh_bits is None:
         raise ValueError("the options leave choices open; `settled` makes them")
@@ -615,13 +588,13 @@ def encoder(
 def to_code(
     splats: Splats, is_leaf: NDArray[np.bool_] | None, fractional_bits: int, sh_bits: int, *, covering: bool
 ) -> Splats:
-    """Return the values that the streams of a file are coded from; those of a file stay as they are.
+    """Return splats with the opacities and SH that are encoded; those read from a file stay as they are.
 
     Args:
-        is_leaf: (N,) which splats are leaves of a tree; None for splats without one.
-        fractional_bits: of the positions, a step of which is too thin to matter.
+        is_leaf: (N,) mask of the leaves of a tree; None without a tree.
+        fractional_bits: fractional bits of positions.
         sh_bits: bits kept of the SH bytes of leaves; merged splats keep `quantize.LEAST_SH_BITS`.
-        covering: opacities make up for the rounding of scales.
+        covering: opacities compensate for the rounding of scales.
     """
     sh = splats.sh
     if sh.shape[1] and len(sh):
@@ -633,7 +606,7 @@ def to_code(
 
 
 def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) -> Bytes:
-    """Return (N, K, 3) bytes of SH, of which merged splats keep fewer bits."""
+    """Encode (N, K, 3) SH as bytes; merged splats keep fewer bits."""
     codes = quantize.encode_sh(sh, sh_bits)
     if is_leaf is not None and sh_bits > quantize.LEAST_SH_BITS:
         codes[~is_leaf] = quantize.encode_sh(sh[~is_leaf], quantize.LEAST_SH_BITS)
@@ -641,40 +614,37 @@ def sh_codes(sh: FloatArray, is_leaf: NDArray[np.bool_] | None, sh_bits: int) ->
 
 
 def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
-    """Return the values that SPZ holds without clamping them."""
+    """Return the ranges of values that SPZ stores without clamping."""
     return SPZ_RANGES
 
 
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """Return the bytes of a file, piece by piece: an LoD file if the scene has a tree, otherwise a plain one.
+    """Yield the bytes of a file, with a tree if the scene has one; the same for any number of threads.
 
-    The same scene and options give the same bytes for any number of threads.
-
-    Raises:
-        FormatError: a coordinate does not fit the fractional bits; the text names the most that would.
+    Raises the errors of `settled`.
     """
     of_scene = encoder(scene, settled(scene, options))
     windows = list(results(of_scene, scene, threads, progress, "encoding"))
     yield from of_scene.pieces(lambda number, name: windows[number][name], threads=threads, progress=progress)
 
 
-#: Codes of a file: its layout, and (N, bytes) of each stream by name. Decoding and encoding again is not the same: a
-#: rotation whose two largest components are equal, but for rounding, may get another code.
+#: Codes of a file: its layout, and (N, bytes) of each stream by name. Decoding and encoding again may change them: a
+#: rotation whose two largest components differ only by rounding may get another code.
 StoredCodes = tuple[Layout, Mapping[str, Bytes]]
 
 
 def stored(source: OpenFile, options: WriteOptions) -> tuple[StoredCodes, WriteOptions]:
-    """Read the codes of a file; raises `FormatError` as `open_content`.
+    """Read the codes of a file; raises the errors of `open_content`.
 
     Returns:
-        the codes, and the options, which have the file's value where they leave a choice open.
+        the codes, and the options, in which the values of the file replace None, see `like`.
     """
-    layout, rows, *_ = open_streams(source.file, source.size)
-    codes = {each.name: np.empty((layout.count, each.size), np.uint8) for each in layout.streams()}
-    for each, part, some in rows:
-        codes[each.name][part] = some
-    if layout.version > 1 and layout.fractional_bits <= MAX_FRACTIONAL_BITS:  # positions in a coding that is written
-        options = like({"version": layout.version, "fractional_bits": layout.fractional_bits}, options)
+    layout, rows, header, *_ = open_streams(source.file, source.size)
+    codes = {stream.name: np.empty((layout.count, stream.size), np.uint8) for stream in layout.streams()}
+    for stream, part, block in rows:
+        codes[stream.name][part] = block
+    if layout.version > 1 and layout.fractional_bits <= MAX_FRACTIONAL_BITS:  # such positions can be written
+        options = like(header, options)
     return (layout, codes), options
