@@ -99,7 +99,8 @@ def write_levels(
     made = dataclasses.replace(made, errors=errors, environment=environment, antialiased=antialiased, up=up)
     size, names = 0, list[str]()
     with out:
-        for name, pieces in encode_files(made, options, settings, threads=threads, progress=progress):
+        division = settings.chunk_splats, settings.extent, settings.min_splats
+        for name, pieces in encode_files(made, options, *division, threads=threads, progress=progress):
             size += out.write(name, pieces)
             names.append(name)
     splats, worst = made.counts.sum(axis=0).tolist(), errors.max(axis=0).tolist()

@@ -1,4 +1,4 @@
-"""The container: a glTF, binary or JSON, its buffers, and accessors, whose bounds are checked before they are read.
+"""Containers of glTF, binary or JSON: buffers, accessors, whose bounds are checked before they are read, and nodes.
 
 Buffers are the BIN chunk, data within the JSON, or files beside it. Facts: the glTF 2.0 specification, sections 3.6
 (binary data), 3.5 (nodes) and 4.4 (the GLB layout).
@@ -34,46 +34,49 @@ from .reader import OpenFile, size_of
 #: Extensions of splats: plain, and with SPZ inside.
 EXTENSION, COMPRESSION = "KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"
 
-#: The header of a binary file, magic, version and length, and of a chunk, length and type.
+#: Header of a binary file: magic, version and length; and of a chunk: length and type.
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAGIC, VERSION = b"glTF", 2
 JSON, BIN = b"JSON", b"BIN\0"
 
-#: Largest binary file, bytes: its length has 32 bits. No number of bytes in the JSON may be larger, either.
+#: Largest binary file, and largest number of bytes in the JSON: lengths have 32 bits.
 MAX_BYTES = (1 << 32) - 1
 
-#: Largest JSON, bytes, without the data within it. That of splats takes some thousands; the meshes beside them may
-#: take more.
+#: Largest JSON in bytes, without the data within it. Splats take some thousands, meshes beside them may take more.
 MAX_JSON = 1 << 22
 
-#: Largest JSON, bytes, with the data within it, which are in memory as a whole. Chosen.
+#: Largest JSON in bytes, with the data within it; all of it is in memory. Chosen.
 MAX_TEXT = 1 << 30
 
 #: Data within the JSON: base64 needs no escapes.
 _DATA = re.compile(rb'"data:[^"\\]*"')
 
-#: Component types: their numpy types.
+#: numpy types of component types.
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 FLOAT = 5126
 
-#: Components of each type of accessor that splats have.
+#: Number of components of the types of accessors that splats have.
 TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
-#: Largest stride of a buffer view, bytes.
+#: Largest stride of a buffer view in bytes.
 MAX_STRIDE = 252
 
 
 @dataclass(frozen=True)
 class Buffer:
-    """Place of the bytes that buffer views divide: a part of a file, or data within the JSON."""
+    """Bytes that buffer views divide: a part of a file, or `data` within the JSON.
+
+    Attributes:
+        name: path relative to the folder of the JSON; None for the file with the JSON.
+    """
 
     start: int
     length: int
-    name: str | None = None  # from the folder of the JSON on; None for the file with the JSON
+    name: str | None = None
     data: bytes | None = None
 
 
-#: Readers of buffers, by their numbers.
+#: Open buffers by their numbers.
 Readers = Mapping[int, OpenFile]
 
 
@@ -82,7 +85,7 @@ class Accessor:
     """`count` values of `width` components in a buffer.
 
     Attributes:
-        offset: of the first value, in the file of the buffer.
+        offset: position of the first value in the file of the buffer.
         stride: bytes from one value to the next.
         normalized: integers mean 0..1, or -1..1.
     """
@@ -96,7 +99,7 @@ class Accessor:
     normalized: bool
 
     def read(self, readers: Readers, start: int, stop: int) -> FloatArray:
-        """Return (stop - start, width) float32 values."""
+        """Read (stop - start, width) float32 values."""
         length = (stop - start - 1) * self.stride + self.width * self.dtype.itemsize
         data = readers[self.buffer].read_at(self.offset + start * self.stride, length)
         if len(data) < length:
@@ -110,11 +113,7 @@ class Accessor:
 
 
 class GltfFile:
-    """A glTF file: `root`, its JSON, and its buffers, which are opened when they are needed.
-
-    Raises:
-        FormatError: the file is no glTF 2, or cut short.
-    """
+    """glTF file: `root`, its JSON, and buffers, which are opened on demand; `FormatError` if it is no glTF 2."""
 
     def __init__(self, source: OpenFile) -> None:
         self._file, self._open_companion = source.file, source.open_companion
@@ -122,6 +121,7 @@ class GltfFile:
         self._chunk: Buffer | None = None
         self._buffers: dict[int, Buffer] = {}
         self._arrays: dict[str, list[dict[str, Any]]] = {}
+        self._data: list[memoryview] = []
         head = self._file.read(HEADER.size)
         self.is_binary = head[:4] == MAGIC
         if self.is_binary:
@@ -129,11 +129,6 @@ class GltfFile:
         else:
             self._file.seek(0)
             text = self._file.read(MAX_TEXT + 1)
-        if len(text) > MAX_TEXT:
-            raise UnsupportedError(
-                f"its JSON has more than the {MAX_TEXT:,} bytes that are read; write it as GLB, or its buffers as files"
-            )
-        self._data: list[memoryview] = []
         self.root = self._parsed(text)
         if not isinstance(self.root, dict):
             raise FormatError("its JSON is no object")
@@ -143,7 +138,7 @@ class GltfFile:
             raise VersionError(f"glTF version {quoted_value(version)} is unknown, only {VERSION} is read")
 
     def _chunks(self, head: bytes) -> bytes:
-        """Return the JSON of a GLB, and set where its BIN chunk is."""
+        """Return the JSON of a GLB, and set the place of its BIN chunk."""
         if len(head) < HEADER.size:
             raise TruncatedError("cut short inside its header")
         _, version, length = HEADER.unpack(head)
@@ -152,17 +147,17 @@ class GltfFile:
         if length > self._size:
             raise TruncatedError(f"cut short: its header announces {length:,} bytes, and it has {self._size:,}")
         at, text = HEADER.size, b""
-        for expected in (JSON, BIN):
+        for expected, name in ((JSON, "JSON"), (BIN, "BIN")):
             if at == length and expected == BIN:
                 break
             self._file.seek(at)
             head = self._file.read(CHUNK.size)
             size, kind = CHUNK.unpack(head) if len(head) == CHUNK.size else (0, b"")
             if kind != expected:
-                raise FormatError(f"its {expected.decode().rstrip(chr(0))} chunk is missing")
+                raise FormatError(f"its {name} chunk is missing")
             at += CHUNK.size
             if at + size > length:
-                raise TruncatedError(f"cut short inside its {expected.decode().rstrip(chr(0))} chunk")
+                raise TruncatedError(f"cut short inside its {name} chunk")
             if kind == JSON:
                 text = self._file.read(min(size, MAX_TEXT + 1))
             else:
@@ -171,7 +166,10 @@ class GltfFile:
         return text
 
     def _parsed(self, text: bytes) -> Any:
-        """Return the value of a JSON text, in which numbers stand for the data, so that it stays small."""
+        """Parse a JSON text whose data are taken out to `_data`, and replaced by their number there."""
+        if len(text) > MAX_TEXT:
+            reason = f"its JSON has more than the {MAX_TEXT:,} bytes that are read"
+            raise UnsupportedError(f"{reason}; write it as GLB, or its buffers as files")
         view = memoryview(text)
 
         def number_of(match: re.Match[bytes]) -> bytes:
@@ -185,7 +183,7 @@ class GltfFile:
 
     @property
     def size(self) -> int:
-        """Bytes of the file, and of the buffer files that were opened so far."""
+        """Size of the file and of the buffer files that were opened so far, in bytes."""
         named = {each.name: each.length for each in self._buffers.values() if each.name is not None}
         return self._size + sum(named.values())
 
@@ -206,33 +204,30 @@ class GltfFile:
         return Json(found[index], Origin(f"{name}[{index}]", FormatError))
 
     def names(self) -> Iterator[str]:
-        """Yield the paths of the files with its buffers, relative to its folder."""
+        """Yield the paths of its buffer files, relative to its folder."""
         for buffer in self.items("buffers"):
             uri = buffer.get("uri")
             if isinstance(uri, str) and not uri.startswith("data:"):
                 yield _name_of(uri)
 
     def buffer(self, index: Any) -> Buffer:
-        """Return a buffer, all of whose bytes are there; `FormatError` otherwise."""
+        """Find a buffer; `FormatError` if some of its bytes are missing."""
         record = self.item("buffers", index)
         if index not in self._buffers:
-            found = self._found(index, record.value.get("uri"))
-            if found.length < record.whole("byteLength", most=MAX_BYTES):
+            found = self._found(index, record.value)
+            length = record.whole("byteLength", most=MAX_BYTES)
+            if found.length < length:
                 where = "the file" if found.name is None else quoted_value(found.name)
-                raise TruncatedError(
-                    f"buffer {index} has {record.value['byteLength']:,} bytes, of which {where} holds {found.length:,}"
-                )
+                raise TruncatedError(f"buffer {index} has {length:,} bytes, of which {where} holds {found.length:,}")
             self._buffers[index] = found
         return self._buffers[index]
 
-    def _found(self, index: int, uri: Any) -> Buffer:
+    def _found(self, index: int, record: Mapping[str, Any]) -> Buffer:
+        uri, extensions = record.get("uri"), record.get("extensions")
         if uri is None:
-            extensions = self.item("buffers", index).value.get("extensions")
             if isinstance(extensions, dict) and extensions:
-                name = quoted_value(next(iter(extensions)))
-                raise UnsupportedError(
-                    f"buffer {index} has no data but those of the extension {name}, which is not read"
-                )
+                text = f"buffer {index} has no data but those of the extension {quoted_value(next(iter(extensions)))}"
+                raise UnsupportedError(f"{text}, which is not read")
             if index or self._chunk is None:
                 raise FormatError(f"buffer {index} has no data: it is neither a BIN chunk nor names a file")
             return self._chunk
@@ -256,20 +251,18 @@ class GltfFile:
 
     @contextlib.contextmanager
     def readers(self, indices: Collection[int]) -> Iterator[Readers]:
-        """Yield readers of buffers, whose files are open until the end."""
-        found: dict[int, OpenFile] = {}
+        """Open buffers until the end of the context."""
         with contextlib.ExitStack() as stack:
-            for index in indices:
-                buffer, file = self.buffer(index), self._file
+
+            def opened(buffer: Buffer) -> BinaryIO:
                 if buffer.data is not None:
-                    file = io.BytesIO(buffer.data)
-                elif buffer.name is not None:
-                    file = stack.enter_context(self._opened(buffer.name))
-                found[index] = OpenFile(file)
-            yield found
+                    return io.BytesIO(buffer.data)
+                return self._file if buffer.name is None else stack.enter_context(self._opened(buffer.name))
+
+            yield {index: OpenFile(opened(self.buffer(index))) for index in indices}
 
     def view(self, index: Any) -> tuple[int, int, int, int | None]:
-        """Return buffer, offset in its file, bytes and stride of a buffer view, which lies within its buffer."""
+        """Return the buffer of a view, the offset in its file, size and stride in bytes; `FormatError` if outside."""
         view = self.item("bufferViews", index)
         number = view.whole("buffer", most=MAX_BYTES)
         buffer = self.buffer(number)
@@ -279,10 +272,10 @@ class GltfFile:
         return number, buffer.start + offset, length, view.optional("byteStride", _bytes)
 
     def accessor(self, index: Any, kind: str, components: tuple[int, ...]) -> Accessor:
-        """Return an accessor, all of whose values lie within its buffer view.
+        """Return an accessor; `FormatError` if values are outside of its buffer view.
 
         Args:
-            index: as the JSON has it, a number or anything else.
+            index: value in the JSON, a number or anything else.
             kind: expected type, such as "VEC3".
             components: expected component types.
         """
@@ -290,14 +283,11 @@ class GltfFile:
         accessor = record.value
         component, normalized = accessor.get("componentType"), accessor.get("normalized", False)
         if accessor.get("type") != kind or component not in components:
-            raise FormatError(
-                f"accessor {index} is {quoted_value(accessor.get('type'))} of {quoted_value(component)}, not {kind} of"
-                f" {' or '.join(map(str, components))}"
-            )
+            text = f"accessor {index} is {quoted_value(accessor.get('type'))} of {quoted_value(component)}"
+            raise FormatError(f"{text}, not {kind} of {' or '.join(map(str, components))}")
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise UnsupportedError(
-                f"accessor {index} is sparse, or has no buffer view; only values in a buffer view are read"
-            )
+            text = f"accessor {index} is sparse, or has no buffer view"
+            raise UnsupportedError(f"{text}; only values in a buffer view are read")
         dtype = np.dtype(COMPONENTS[component])
         buffer, offset, length, stride = self.view(accessor["bufferView"])
         count, inside = record.whole("count", most=MAX_BYTES), record.optional("byteOffset", _bytes, 0)
@@ -311,19 +301,19 @@ class GltfFile:
         return Accessor(buffer, offset + inside, step, count, TYPES[kind], dtype, is_integer and normalized is True)
 
     def bytes_of(self, index: Any) -> bytes:
-        """Return the content of a buffer view."""
+        """Read the content of a buffer view."""
         buffer, offset, length, _ = self.view(index)
         with self.readers([buffer]) as readers:
             return readers[buffer].read_at(offset, length)
 
 
 def _name_of(uri: str) -> str:
-    """Return the path of a relative address, from the folder of the JSON on; it may leave that folder."""
+    """Return the path of a relative address from the folder of the JSON on, which it may leave."""
     return posixpath.normpath(urllib.parse.unquote(uri)) if uri else uri
 
 
 def _unpacked(uri: bytes, index: int) -> bytes:
-    """Decode an address that holds data: data:TYPE;base64,DATA."""
+    """Decode the data in an address, data:TYPE;base64,DATA."""
     kind, _, text = uri.partition(b",")
     data = urllib.parse.unquote_to_bytes(text) if b"%" in text else text
     try:
@@ -337,7 +327,7 @@ def _bytes(value: Json) -> int:
 
 
 def head_of(root: Mapping[str, Any], length: int) -> bytes:
-    """Return the bytes before the content of the BIN chunk, which has `length` bytes, a multiple of 4."""
+    """Encode everything before the content of the BIN chunk, which has `length` bytes, a multiple of 4."""
     text = json.dumps(root, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     total = HEADER.size + 2 * CHUNK.size + len(text) + length
@@ -346,14 +336,14 @@ def head_of(root: Mapping[str, Any], length: int) -> bytes:
 
 
 def check_length(total: int) -> None:
-    """Raise `FormatError` where a file would have too many bytes for its header."""
+    """Raise `FormatError` if a file has too many bytes for its header."""
     if total > MAX_BYTES:
         raise FormatError(f"{total:,} bytes are more than the {MAX_BYTES:,} of a GLB; write fewer splats")
 
 
 Matrix = NDArray[np.float64]
 
-#: Rotations x y z w that turn an axis to +y: about x, so that right stays right, but of x itself.
+#: Rotations x y z w that turn an axis to +y: about x, so that right stays right; the x axis itself about z.
 HALF = math.sqrt(0.5)
 TURNS = {
     "y": (0.0, 0.0, 0.0, 1.0),
@@ -364,12 +354,12 @@ TURNS = {
     "-x": (0.0, 0.0, -HALF, HALF),
 }
 
-#: How far axes of a node may be from right angles, and from one length, as a share: float32 leaves 1e-7. Chosen.
+#: Allowed deviation of a node's axes from right angles and from equal lengths: float32 leaves 1e-7. Chosen.
 SKEW = 1e-5
 
 
 class GltfNodes:
-    """Nodes of a glTF, and the scene that a viewer shows."""
+    """Nodes of a glTF and their transforms to the scene."""
 
     def __init__(self, file: GltfFile) -> None:
         self.records = file.items("nodes")
@@ -386,14 +376,10 @@ class GltfNodes:
     def having(self, meshes: Collection[int]) -> tuple[list[int], int]:
         """Return the nodes with these meshes that a viewer shows, in order, and the number of hidden nodes.
 
-        All are shown where the file has no scene, or one without any of them.
+        If the file has no scene, or one without any of them, all count as shown.
         """
-        wanted = set(meshes)
-        having = [
-            number
-            for number, node in enumerate(self.records)
-            if type(node.get("mesh")) is int and node["mesh"] in wanted
-        ]
+        nodes = enumerate(self.records)
+        having = [number for number, node in nodes if type(node.get("mesh")) is int and node["mesh"] in meshes]
         for number in having:
             for each in self._down_to(number, self._is_shown):
                 parent = self._parent.get(each)
@@ -402,7 +388,7 @@ class GltfNodes:
         return (shown, len(having) - len(shown)) if shown else (having, 0)
 
     def matrix(self, number: int) -> Matrix:
-        """Return the (4, 4) matrix from a node to the scene, for column vectors."""
+        """Return the (4, 4) matrix of a node to the scene, for column vectors."""
         for each in self._down_to(number, self._matrices):
             own, parent = _matrix(self.records[each]), self._parent.get(each)
             self._matrices[each] = own if parent is None else product(self._matrices[parent], own)
@@ -422,7 +408,7 @@ class GltfNodes:
 
 
 def _roots_of_scene(file: GltfFile) -> frozenset[int]:
-    """Return the roots of the scene that a viewer shows, the first unless the file says otherwise."""
+    """Return the roots of the scene that a viewer shows, by default the first."""
     scenes = file.items("scenes")
     number = file.root.get("scene", 0)
     if type(number) is not int or not 0 <= number < len(scenes):
@@ -432,7 +418,7 @@ def _roots_of_scene(file: GltfFile) -> frozenset[int]:
 
 
 def product(outer: Matrix, inner: Matrix) -> Matrix:
-    """Return the product of two (4, 4) matrices; `FormatError` if a number of it is not finite or beyond `LARGEST`."""
+    """Multiply two (4, 4) matrices; `FormatError` if a number of the product is not finite or beyond `LARGEST`."""
     with np.errstate(all="ignore"):
         matrix = outer @ inner
         if not (np.abs(matrix) <= LARGEST).all():
@@ -461,7 +447,7 @@ def _numbers(node: dict[str, Any], name: str, count: int, default: tuple[float, 
 
 
 def transform_of(matrix: Matrix) -> Transform:
-    """Return a (4, 4) matrix as a rotation, a uniform scale and a translation.
+    """Split a (4, 4) matrix into a rotation, a uniform scale and a translation.
 
     Raises:
         FormatError: it is singular, or out of the range of a `Transform`.
@@ -490,11 +476,11 @@ def transform_of(matrix: Matrix) -> Transform:
 
 
 def rotation_of_up(up: str | None) -> Matrix:
-    """Return the (3, 3) turn of an axis to +y, exactly; the identity where it is unknown."""
+    """Return the exact (3, 3) turn of an axis to +y; the identity for an unknown axis."""
     return np.rint(rotation_matrices(np.array([TURNS[up or "y"]]))[..., 0]) + 0.0  # no -0
 
 
 def is_turn_of(transform: Transform, up: str) -> bool:
-    """Return True if a transform is the turn of an axis to +y, and nothing else."""
+    """Return whether a transform is just the turn of an axis to +y."""
     at_rest = transform.scale == 1 and not transform.translation.any()
     return at_rest and bool(np.abs(transform.rotation - rotation_of_up(up)).max() <= SKEW)

@@ -9,7 +9,7 @@ import struct
 import threading
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
 from typing import IO, BinaryIO
@@ -17,6 +17,7 @@ from typing import IO, BinaryIO
 import numpy as np
 
 from ..model.scene import common_axis, differing, rotated_axis
+from ..model.sh import width_of
 from ..model.splats import COLUMNS, Splats
 from ..model.transforms import Transform
 from ..system.errors import ChecksumError, FormatError, NotSplatsError, UnsupportedError, naming
@@ -183,12 +184,8 @@ class SceneFiles:
             done += rows
             progress("reading", done, len(out), "splat")
 
-    def fill(self, chunks: Sequence[Chunk], degree: int, threads: int) -> Fill:
-        """Return the `Reader.fill` of files; where blocks are read, one file stays in memory.
-
-        Args:
-            chunks: in the order of the rows of their pieces, where these are read in blocks.
-        """
+    def _fill(self, chunks: Sequence[Chunk], degree: int, threads: int) -> Fill:
+        """Return the `Reader.fill` of files; reading blocks keeps one file in memory, and needs rows in their order."""
         count = sum(chunk.rows for chunk in chunks)
         last: dict[int, Splats] = {}  # of the file that was read last, by its number
 
@@ -208,6 +205,28 @@ class SceneFiles:
                 last.clear()
 
         return fill
+
+    def reader(
+        self,
+        chunks: Sequence[Chunk],
+        format: str,
+        header: Mapping[str, int],
+        size: int,
+        notes: Iterable[str],
+        threads: int,
+    ) -> Reader:
+        """Return a reader of the splats of files, one after the other.
+
+        Args:
+            size: bytes of the files that name them.
+            notes: those about the scene, before the notes about files.
+        """
+        degree, size = max(chunk.sh_degree for chunk in chunks), size + sum(chunk.bytes for chunk in chunks)
+        count, header = sum(chunk.rows for chunk in chunks), {**header, "bytes": size}
+        check_promise(count * 4 * width_of(degree), size)
+        every = tuple(dict.fromkeys([*notes, *(note for chunk in chunks for note in chunk.notes)]))
+        antialiased = any(chunk.antialiased for chunk in chunks)
+        return Reader(count, degree, format, self._fill(chunks, degree, threads), antialiased, every, header)
 
     def violations(
         self,

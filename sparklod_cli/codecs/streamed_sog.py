@@ -1,13 +1,13 @@
 """Streamed SOG: a manifest, lod-meta.json, and unpacked SOG scenes beside it, each with runs of one detail level.
 
-As a scene it is full detail, level 0, and the environment; `decode_parts` reads all levels.
+Read as a scene, it is full detail, level 0, and the environment; `decode_parts` reads all levels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import BinaryIO, NamedTuple, Protocol
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +15,16 @@ from numpy.typing import NDArray
 from ..model import morton
 from ..model.instances import Bounds, Counts, DetailScene
 from ..model.scene import Scene, facts_of
-from ..model.sh import width_of
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..system.units import count_of
 from ..system.untrusted import quoted_value
 from . import quantize, sog
-from .compression import check_promise
 from .format_rules import check_rules, error_of
 from .formats import ENVIRONMENT_FILE, MANIFEST, META, WriteOptions, chunk_folder
 from .merging import Chunk
-from .reader import OpenCompanion, OpenFile, Reader, note_of, size_of
+from .reader import OpenCompanion, OpenFile, Reader, note_of
 from .streamed_manifest import (
     MAX_MANIFEST,
     VERSION,
@@ -45,17 +43,14 @@ Index = NDArray[np.int64]
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open level 0, chunk after chunk, and then the environment.
-
-    Nothing is unpacked to `scratch`: where blocks are read, one chunk at a time stays in memory.
-    """
+    """Open level 0, chunk after chunk, and then the environment; reading blocks keeps one chunk in memory."""
     return _open(source, full_detail=True)[1]
 
 
 def decode_parts(
     file: BinaryIO, *, threads: int = 1, progress: Progress = silent, open_companion: OpenCompanion | None = None
 ) -> DetailScene:
-    """Read all detail levels, in any order of the runs in the chunks; regions are in the order of the tree."""
+    """Read all detail levels; regions are in the order of the tree."""
     layout, content = _open(OpenFile(file, open_companion, threads=threads), full_detail=False)
     regions = [node for _, node in layout.manifest.regions()]
     bounds, children = np.array([node.bound for node in regions], np.float64), layout.children()
@@ -74,8 +69,8 @@ class RegionLayout:
     """Manifest as arrays: R regions in the order of the tree, L detail levels.
 
     Attributes:
-        file, offset, count, level, region: (n,) of the runs that are not empty, in the order of the files, which they
-            tile.
+        file, offset, count, level, region: (n,) columns of the runs that are not empty, in the order of files and
+            offsets.
         counts: (R, L) splats of each region at each level.
     """
 
@@ -88,7 +83,7 @@ class RegionLayout:
     counts: Counts
 
     def children(self) -> Index:
-        """Return (R - 1, 2) the tree as in `DetailScene`; it must be a binary one."""
+        """Return the binary tree over the regions as (R - 1, 2) `DetailScene.children`."""
         nodes = self.manifest.nodes
         numbers = np.empty(len(nodes), np.int64)
         inner = [number for number, node in enumerate(nodes) if node.children]
@@ -98,24 +93,24 @@ class RegionLayout:
 
 
 def layout_of(manifest: Manifest) -> RegionLayout:
-    """Return the layout of a manifest, whose runs must tile the files that they are in."""
+    """Return the layout of a manifest whose runs lie end to end in their files."""
+    regions = [node.runs or {} for _, node in manifest.regions()]
     rows = [
         (run.file, run.offset, run.count, level, region)
-        for region, (_, node) in enumerate(manifest.regions())
-        for level, run in (node.runs or {}).items()
+        for region, runs in enumerate(regions)
+        for level, run in runs.items()
         if run.count
     ]
     table = np.array(rows, np.int64).reshape(-1, 5)
     file, offset, count, level, region = np.ascontiguousarray(table[np.lexsort((table[:, 1], table[:, 0]))].T)
-    counts = np.zeros((sum(1 for _ in manifest.regions()), manifest.levels), np.int64)
+    counts = np.zeros((len(regions), manifest.levels), np.int64)
     counts[region, level] = count
     return RegionLayout(manifest, file, offset, count, level, region, counts)
 
 
 def _open(source: OpenFile, *, full_detail: bool) -> tuple[RegionLayout, Reader]:
     """Read a manifest, and open its chunks: those of level 0, or all."""
-    size, beside = size_of(source.file), chunk_files(source.open_companion)
-    manifest = parse(source.file.read(MAX_MANIFEST + 1))
+    beside, manifest = chunk_files(source.open_companion), parse(source.file.read(MAX_MANIFEST + 1))
     check_rules(run_violations(manifest) if full_detail else violations(manifest))
     layout = layout_of(manifest)
     if full_detail:
@@ -125,60 +120,36 @@ def _open(source: OpenFile, *, full_detail: bool) -> tuple[RegionLayout, Reader]
         chosen, flat = np.ones(len(layout.level), np.bool_), layout.counts.T.ravel()
         rows = (np.cumsum(flat) - flat)[layout.level * len(layout.counts) + layout.region]
     files, first = np.unique(layout.file, return_index=True)
-    names, chunks = set[str](), list[Chunk]()
-    ends = np.append(first[1:], len(layout.file))
-    for file, begin, end in zip(files.tolist(), first.tolist(), ends.tolist(), strict=False):
-        here = begin + np.flatnonzero(chosen[begin:end])
-        if not len(here):
+    chunks = dict[str, Chunk]()
+    for file, own in zip(files.tolist(), np.split(np.arange(len(rows)), first[1:]), strict=False):
+        read = own[chosen[own]]
+        if not len(read):
             continue
         name = manifest.filenames[file]
-        if name in names:
+        if name in chunks:
             raise FormatError(f"{MANIFEST} names {quoted_value(name)} twice")
-        names.add(name)
-        pieces = [(int(layout.offset[run]), int(layout.count[run]), int(rows[run])) for run in here]
-        chunks.append(beside.open(name, pieces))
-        if chunks[-1].count != (expected := int(layout.count[begin:end].sum())):
-            has = count_of(chunks[-1].count, "splat")
-            text = f"{quoted_value(name)} has {has}, but its runs in {MANIFEST} have {expected:,}"
-            raise error_of("streamed-sog.runs", text)
+        pieces = np.stack([layout.offset[read], layout.count[read], rows[read]], axis=1).tolist()
+        chunk = chunks[name] = beside.open(name, [(offset, count, row) for offset, count, row in pieces])
+        if chunk.count != (expected := int(layout.count[own].sum())):
+            text = f"{quoted_value(name)} has {count_of(chunk.count, 'splat')}"
+            raise error_of("streamed-sog.runs", f"{text}, but its runs in {MANIFEST} have {expected:,}")
     if not chunks:
         raise FormatError(f"{MANIFEST} has no splats of {'level 0' if full_detail else 'any level'}")
+    every, note = list(chunks.values()), manifest.noted
     if manifest.environment is not None:
-        chunks.append(beside.open(manifest.environment, row=sum(chunk.rows for chunk in chunks)))
-    count, degree = sum(chunk.rows for chunk in chunks), max(chunk.sh_degree for chunk in chunks)
-    size += sum(chunk.bytes for chunk in chunks)
-    check_promise(count * 4 * width_of(degree), size)
+        every.append(beside.open(manifest.environment, row=sum(chunk.rows for chunk in every)))
     regions, levels = layout.counts.shape
-    header = {"version": VERSION, "levels": levels, "regions": regions, "bytes": size}
-    antialiased, note = any(chunk.antialiased for chunk in chunks), manifest.noted
-    notes = dict.fromkeys((*note.problems, *(text for chunk in chunks for text in chunk.notes)))
-    form = f"Streamed SOG {VERSION}"
-    fill = beside.fill(chunks, degree, source.threads)
-    return layout, Reader(count, degree, form, fill, antialiased, tuple(notes), header, note.up)
+    header = {"version": VERSION, "levels": levels, "regions": regions}
+    form, notes = f"Streamed SOG {VERSION}", note.problems
+    return layout, replace(beside.reader(every, form, header, source.size, notes, source.threads), up=note.up)
 
 
 #: Chunks that are encoded at a time: each takes some 0.5 KB a splat with SH of degree 2, measured.
 TOGETHER = 2
 
 
-class Divided(Protocol):
-    """Division of a scene into regions, for the manifest; `lod.tree_settings.DetailSettings` is one."""
-
-    @property
-    def chunk_splats(self) -> int:
-        """A chunk is closed when it has more splats than this."""
-
-    @property
-    def extent(self) -> float:
-        """Longest side, in world units, beyond which a region is divided."""
-
-    @property
-    def min_splats(self) -> int:
-        """A region of fewer splats is not divided for its extent."""
-
-
 class ChunkPlan(NamedTuple):
-    """Chunk to write: its folder, the detail level of its runs, and the regions whose runs it has, side by side."""
+    """Chunk to write: its folder, the detail level of its runs, and their consecutive regions."""
 
     folder: str
     level: int
@@ -186,11 +157,23 @@ class ChunkPlan(NamedTuple):
 
 
 def encode_files(
-    scene: DetailScene, options: WriteOptions, settings: Divided, *, threads: int = 1, progress: Progress = silent
+    scene: DetailScene,
+    options: WriteOptions,
+    chunk_splats: int,
+    extent: float,
+    min_splats: int,
+    *,
+    threads: int = 1,
+    progress: Progress = silent,
 ) -> Iterator[tuple[str, Iterable[bytes]]]:
-    """Return the files of a scene by name, which has a folder ("0_0/meta.json"); lod-meta.json comes last.
+    """Yield the files of a scene by path ("0_0/meta.json"); lod-meta.json comes last.
 
     Within a run, splats are in Morton order. The bytes are the same for any number of threads.
+
+    Args:
+        chunk_splats: a chunk ends when it has more splats.
+        extent: longest side of undivided regions in world units, for the manifest.
+        min_splats: number of splats below which a region is not divided for its extent, for the manifest.
 
     Raises:
         FormatError: SOG cannot hold the splats, or float32, as viewers have it, not the bounds of the regions.
@@ -200,39 +183,38 @@ def encode_files(
         raise FormatError(
             f"its regions reach {reach:.3g}, and viewers hold at most {quantize.LARGEST:.3g}; scale it down"
         )
-    plans = planned(scene, settings.chunk_splats)
+    plans = _planned(scene, chunk_splats)
     total = len(scene.splats) + (0 if scene.environment is None else len(scene.environment))
     together = min(threads, TOGETHER)
 
     def encoded(plan: ChunkPlan | None) -> tuple[int, list[tuple[str, bytes]]]:
         """Return the number of splats and the files of a chunk; of the environment for None."""
-        if plan is None:
-            assert scene.environment is not None
-            part = scene.environment
-        else:
-            runs = (scene.run(region, plan.level) for region in plan.regions)
-            index = [run.start + morton.order(scene.splats.center[run]) for run in runs if run.start < run.stop]
-            part = scene.splats.take(np.concatenate(index))
-        one = Scene(part, antialiased=scene.antialiased, up=scene.up)
         inside = max(1, threads // together)
         if plan is None:
-            return len(part), [(ENVIRONMENT_FILE, b"".join(sog.encode(one, options, threads=inside)))]
+            assert scene.environment is not None
+            one = Scene(scene.environment, antialiased=scene.antialiased, up=scene.up)
+            return len(one), [(ENVIRONMENT_FILE, b"".join(sog.encode(one, options, threads=inside)))]
+        runs = (scene.run(region, plan.level) for region in plan.regions)
+        index = [run.start + morton.order(scene.splats.center[run]) for run in runs if run.start < run.stop]
+        one = Scene(scene.splats.take(np.concatenate(index)), antialiased=scene.antialiased, up=scene.up)
         files = sog.encode_files(one, options, threads=inside, in_order=True)
-        return len(part), [(f"{plan.folder}/{name}", data) for name, data in files]
+        return len(one), [(f"{plan.folder}/{name}", data) for name, data in files]
 
-    jobs: list[ChunkPlan | None] = [*plans]
-    if scene.environment is not None:
-        jobs.append(None)
     done = 0
-    for count, files in ordered_map(encoded, jobs, together):
+    for count, files in ordered_map(encoded, [*plans, *([] if scene.environment is None else [None])], together):
         for name, data in files:
             yield name, [data]
         done += count
         progress("writing", done, total, "splat")
-    yield MANIFEST, [serialise(manifest_of(scene, plans, settings))]
+    asset = {
+        "chunkGaussians": chunk_splats,
+        "chunkExtent": int(extent) if extent == int(extent) else extent,
+        "chunkMinGaussians": min_splats,
+    }
+    yield MANIFEST, [serialise(_manifest_of(scene, plans, asset))]
 
 
-def planned(scene: DetailScene, chunk_splats: int) -> list[ChunkPlan]:
+def _planned(scene: DetailScene, chunk_splats: int) -> list[ChunkPlan]:
     """Divide the runs of each level into chunks, region by region, until a chunk is large enough."""
     plans = list[ChunkPlan]()
     for level in range(scene.levels):
@@ -245,8 +227,7 @@ def planned(scene: DetailScene, chunk_splats: int) -> list[ChunkPlan]:
     return plans
 
 
-def manifest_of(scene: DetailScene, plans: list[ChunkPlan], settings: Divided) -> Manifest:
-    """Return the manifest of a scene in chunks."""
+def _manifest_of(scene: DetailScene, plans: list[ChunkPlan], asset: dict[str, Any]) -> Manifest:
     runs: list[dict[int, Run]] = [{} for _ in range(scene.regions)]
     for number, plan in enumerate(plans):
         offset = 0
@@ -258,12 +239,7 @@ def manifest_of(scene: DetailScene, plans: list[ChunkPlan], settings: Divided) -
     counts = scene.counts.sum(axis=0).tolist()
     head = {
         "version": VERSION,
-        "asset": note_of(up=scene.up)
-        | {
-            "chunkGaussians": settings.chunk_splats,
-            "chunkExtent": int(settings.extent) if settings.extent == int(settings.extent) else settings.extent,
-            "chunkMinGaussians": settings.min_splats,
-        },
+        "asset": note_of(up=scene.up) | asset,
         "count": sum(counts),
         "counts": counts,
         "lodErrors": scene.errors is not None,
@@ -274,8 +250,11 @@ def manifest_of(scene: DetailScene, plans: list[ChunkPlan], settings: Divided) -
 
 
 def _nodes(scene: DetailScene, runs: list[dict[int, Run]]) -> list[ManifestNode]:
-    """Return the tree of a scene, depth first; an inner node has the union of the bounds below."""
-    corners = _inner_bounds(scene)
+    """Return the tree of a scene, depth first; the bound of an inner node is the union of its children's."""
+    corners = np.empty((len(scene.children), 2, 3))
+    for place in reversed(range(len(corners))):  # children come after their parents
+        below = [corners[child] if child >= 0 else scene.bounds[-1 - child] for child in scene.children[place]]
+        corners[place] = np.minimum(below[0][0], below[1][0]), np.maximum(below[0][1], below[1][1])
     nodes, children = list[ManifestNode](), list[list[int]]()
     waiting = [(0 if len(scene.children) else -1, -1)]
     while waiting:
@@ -292,15 +271,6 @@ def _nodes(scene: DetailScene, runs: list[dict[int, Run]]) -> list[ManifestNode]
             nodes.append(ManifestNode(_bound(corners[place]), (), None, None, parent))
             waiting += [(int(child), number) for child in scene.children[place][::-1]]
     return [replace(node, children=tuple(below)) for node, below in zip(nodes, children, strict=True)]
-
-
-def _inner_bounds(scene: DetailScene) -> Bounds:
-    """Return (R - 1, 2, 3) the bounds of inner nodes; children come after their parents."""
-    bounds = np.empty((len(scene.children), 2, 3))
-    for number in reversed(range(len(bounds))):
-        below = [bounds[child] if child >= 0 else scene.bounds[-1 - child] for child in scene.children[number]]
-        bounds[number] = np.minimum(below[0][0], below[1][0]), np.maximum(below[0][1], below[1][1])
-    return bounds
 
 
 def _bound(corners: Bounds) -> Bound:

@@ -1,7 +1,7 @@
 """3D Tiles: a tileset.json and a GLB for each tile, whose children replace it by more splats.
 
-As a scene it is full detail, the tiles without children; `decode_parts` reads all tiles. Tilesets of other programs are
-read if their tiles are listed one by one, replace their parents, and have glTF, binary or JSON, with splats.
+Read as a scene, it is full detail, the tiles without children; `decode_parts` reads all tiles. Tilesets of other
+programs are read if their tiles are listed one by one, replace their parents, and have glTF with splats.
 """
 
 from __future__ import annotations
@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 
 from ..model.instances import TileScene
 from ..model.scene import Scene, common_axis, facts_of
-from ..model.sh import width_of
 from ..system.errors import FormatError
 from ..system.progress import Progress, silent
 from ..system.threads import ordered_map
 from ..system.untrusted import quoted_value
 from . import gltf
-from .compression import check_promise
 from .format_rules import check_rules, error_of
 from .formats import CESIUM, TILES, TILESET, WriteOptions
 from .gltf_container import transform_of
@@ -49,17 +47,16 @@ from .tileset import (
     volumes_of,
 )
 
-#: Note of scenes whose splats have the coordinates of their tileset.
+#: Note on scenes whose tileset has a transform.
 NOT_PLACED = Note("the transform of the tileset, its place on the Earth, is not applied")
 
 Matrix = NDArray[np.float64]
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open the tiles without children, one after the other.
+    """Open the tiles without children, one after the other; reading blocks keeps one tile in memory.
 
-    The transform of the root is not applied: splats are where they are in the axes of the scene, not on the Earth.
-    Nothing is unpacked to `scratch`: where blocks are read, one tile at a time stays in memory.
+    The transform of the root, which places the scene on the Earth, is not applied.
     """
     tileset = _read(source.file, source.open_companion)
     wanted = [number for number, tile in enumerate(tileset.tiles) if not tile.children and tile.uri is not None]
@@ -69,9 +66,7 @@ def open_content(source: OpenFile) -> Reader:
 def decode_parts(
     file: BinaryIO, *, threads: int = 1, progress: Progress = silent, open_companion: OpenCompanion | None = None
 ) -> TileScene:
-    """Read all tiles, level by level: the level of a tile is the number of edges to the root.
-
-    A tile that stands for a nested tileset is one with the root of that.
+    """Read all tiles by level, their depth in the tree; a tile with a nested tileset is one with the nested root.
 
     Raises:
         FormatError: as `open_content`; or a bounding volume is a region, or a number is wrong.
@@ -82,8 +77,8 @@ def decode_parts(
     held = [number for number in order if tileset.tiles[number].uri is not None]
     content, chunks = _open(source, tileset, held)
     scene = replace(content, threads=threads).scene(progress=progress)
-    counts = dict(zip(held, (chunk.rows for chunk in chunks), strict=True))
-    sizes = dict(zip(held, (chunk.bytes for chunk in chunks), strict=True))
+    files = dict(zip(held, ((chunk.rows, chunk.bytes) for chunk in chunks), strict=True))
+    counts, sizes = np.array([files.get(number, (0, 0)) for number in order], np.int64).T
     check_rules(violations(tileset))
     volumes = volumes_of(tileset)
     boxes = [volume.bounds() for number in order if isinstance(volume := volumes[number], Volume)]
@@ -94,20 +89,17 @@ def decode_parts(
         scene.splats,
         parent,
         level,
-        np.array([counts.get(number, 0) for number in order], np.int64),
+        np.ascontiguousarray(counts),
         errors,
         turned(np.array(boxes), to_tileset(scene.up).T),
-        np.array([sizes.get(number, 0) for number in order], np.int64),
+        np.ascontiguousarray(sizes),
         _root_transform(tileset),
         **facts_of(scene),
     )
 
 
 def names_of(data: bytes, open_companion: OpenCompanion) -> list[str]:
-    """Return the files that a tileset, nested tilesets and their tiles name, except buffers without splats.
-
-    Paths begin in the folder of the tileset.
-    """
+    """Return the paths of all files of a tileset, relative to its folder, except buffers without splats."""
     names = dict.fromkeys(read_whole(data, open_companion).names())
     for name in [each for each in names if each.lower().endswith(".gltf")]:
         opened = list[str]()
@@ -129,7 +121,7 @@ def _read(file: BinaryIO, open_companion: OpenCompanion | None) -> Tileset:
 
 
 def _hierarchy(tileset: Tileset) -> tuple[list[int], NDArray[np.int32], NDArray[np.int32]]:
-    """Return tiles in order of depth, without those that stand for nested tilesets, their parents and levels."""
+    """Return the tiles without nested tilesets by depth, and the places of their parents and depths."""
     tiles, order, parent, level = tileset.tiles, list[int](), list[int](), list[int]()
     frontier = [(0, -1)]
     while frontier:
@@ -147,7 +139,7 @@ def _hierarchy(tileset: Tileset) -> tuple[list[int], NDArray[np.int32], NDArray[
 
 
 def _open(source: OpenFile, tileset: Tileset, wanted: Sequence[int]) -> tuple[Reader, list[Chunk]]:
-    """Return the content of tiles, one after the other, and their files."""
+    """Return a reader of tiles, one after the other, and their files."""
     if not wanted:
         raise FormatError("no tile of it has splats")
     matrices, files = matrices_of(tileset), dict[str, int]()
@@ -155,32 +147,25 @@ def _open(source: OpenFile, tileset: Tileset, wanted: Sequence[int]) -> tuple[Re
         name = tileset.tiles[number].name
         assert name is not None
         if name in files:
-            raise error_of(
-                "tiles.shared", f"two tiles have the content {quoted_value(name)}; such tilesets are not read"
-            )
+            text = f"two tiles have the content {quoted_value(name)}; such tilesets are not read"
+            raise error_of("tiles.shared", text)
         files[name] = number
     beside = tile_files(source.open_companion, {name: matrices[number] for name, number in files.items()})
     chunks, row = list[Chunk](), 0
     for name in files:
         chunks.append(beside.open(name, row=row))
         row += chunks[-1].rows
-    degree, size = max(chunk.sh_degree for chunk in chunks), tileset.bytes + sum(chunk.bytes for chunk in chunks)
-    check_promise(row * 4 * width_of(degree), size)
-    notes = tuple(dict.fromkeys(note for chunk in chunks for note in chunk.notes))
-    if not np.array_equal(_root_transform(tileset), np.eye(4)):
-        notes += (NOT_PLACED,)
+    form = f"3D Tiles {tileset.head['asset']['version']} of {chunks[0].format}"
+    content = beside.reader(chunks, form, {"tiles": len(chunks)}, tileset.bytes, (), source.threads)
     if len({chunk.up for chunk in chunks}) > 1:
         raise error_of("tiles.kind", "the axes that point up in its tiles differ; such tilesets are not read")
-    up, antialiased = common_axis(chunk.up for chunk in chunks), any(chunk.antialiased for chunk in chunks)
-    form = f"3D Tiles {tileset.head['asset']['version']} of {chunks[0].format}"
-    header = {"tiles": len(chunks), "bytes": size}
-    fill = beside.fill(chunks, degree, source.threads)
-    by = common_axis(chunk.up_by for chunk in chunks) or ""
-    return Reader(row, degree, form, fill, antialiased, notes, header, up, up_by=by), chunks
+    notes = content.notes if np.array_equal(_root_transform(tileset), np.eye(4)) else (*content.notes, NOT_PLACED)
+    up, by = common_axis(chunk.up for chunk in chunks), common_axis(chunk.up_by for chunk in chunks) or ""
+    return replace(content, notes=notes, up=up, up_by=by), chunks
 
 
 def tile_files(open_companion: OpenCompanion | None, matrices: dict[str, Matrix]) -> SceneFiles:
-    """Return the glTF files of tiles, whose (4, 4) transforms are applied when they are read."""
+    """Return the glTF files of tiles; reading applies their (4, 4) transforms, `matrices` by name."""
 
     def open_tile(name: str, source: OpenFile) -> Reader:
         content = gltf.open_content(source)
@@ -198,8 +183,8 @@ def _root_transform(tileset: Tileset) -> Matrix:
     return matrix_of(tileset.tiles[0].record)
 
 
-#: Tiles of a tileset file from which on its subtrees go to files of their own, each of at most as many; and the least
-#: tiles for which such a file is made. A tile takes some 300 bytes of JSON. Chosen.
+#: Most tiles of a tileset file; larger trees have nested files, each of at most as many tiles, and of at least
+#: `LEAST_NESTED`. A tile takes some 300 bytes of JSON. Chosen.
 MOST_TILES, LEAST_NESTED = 1_000, 16
 
 JsonObject = dict[str, Any]
@@ -213,14 +198,14 @@ def encode_files(
     progress: Progress = silent,
     most_tiles: int = MOST_TILES,
 ) -> Iterator[tuple[str, Iterable[bytes]]]:
-    """Return the files of a scene by name, tiles first ("tiles/2-17.glb") and tileset.json last.
+    """Yield the files of a scene by path, tiles first ("tiles/2-17.glb") and tileset.json last.
 
     The bytes are the same for any number of threads.
 
     Args:
-        scene: its opacities are at most 1.
-        options: the profile of the GLBs is "cesium" by default.
-        most_tiles: of a tileset file; more are in nested ones.
+        scene: scene with opacities of at most 1.
+        options: options of the GLBs, whose profile is "cesium" by default.
+        most_tiles: most tiles of a tileset file; more are in nested ones.
     """
     if not (np.abs(scene.bounds) <= LARGEST).all() or not (scene.errors <= LARGEST).all():
         raise FormatError("its splats reach beyond what float32 holds, in which viewers draw; scale it down")
@@ -250,7 +235,7 @@ def _tilesets(
         under[scene.parent[tile]] += under[tile]
     nested = (under[1:] <= most_tiles) & (under[scene.parent[1:]] > most_tiles) & (under[1:] >= LEAST_NESTED)
     is_nested = np.concatenate([[False], nested])
-    in_folder = is_nested.copy()  # tiles that a nested tileset describes
+    in_folder = is_nested.copy()  # tiles in nested tilesets
     for tile in range(1, scene.tiles):
         in_folder[tile] |= in_folder[scene.parent[tile]]
     children: list[list[JsonObject]] = [[] for _ in range(scene.tiles)]
@@ -278,13 +263,13 @@ def _tilesets(
 
 
 def box_of(corners: Any) -> list[float]:
-    """Return the numbers of a bounding volume "box": its middle, and half of its sides."""
+    """Return the numbers of a bounding volume "box": its centre and half sides."""
     (a, b, c), (d, e, f) = (corners.mean(axis=0).tolist(), ((corners[1] - corners[0]) / 2).tolist())
     return [a, b, c, d, 0.0, 0.0, 0.0, e, 0.0, 0.0, 0.0, f]
 
 
 def _tileset(scene: TileScene, options: WriteOptions, root: JsonObject, error: float) -> JsonObject:
-    """Return a tileset; `error` is its geometric error where none of it is drawn."""
+    """Return a tileset file; `error` is the geometric error of drawing nothing of it."""
     extensions = gltf.extensions_of(options.glb_profile)
     return {
         "asset": {"version": VERSION, "extras": note_of(antialiased=scene.antialiased, up=scene.up)},

@@ -22,7 +22,6 @@ from sparklod_cli.codecs.merging import SceneFiles
 from sparklod_cli.codecs.streamed_manifest import LARGEST, Manifest, ManifestNode, Run, parse, serialise
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.io.writing import parts_output
-from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model import morton
 from sparklod_cli.model.instances import DetailScene
 from sparklod_cli.model.scene import Scene
@@ -41,7 +40,7 @@ pytestmark = pytest.mark.filterwarnings("error")
 GOLDEN = FIXTURES / "golden" / "sh1-streamed-sog"
 
 #: Chunks of each level of `COUNTS` are closed when they have more splats than this.
-SETTINGS = DetailSettings(chunk_splats=45, extent=2.5, min_splats=10)
+DIVISION = 45, 2.5, 10
 
 
 @functools.cache
@@ -64,7 +63,7 @@ def first_leaf(meta: Any) -> Any:
 
 
 def written(scene: DetailScene, **more: Any) -> dict[str, bytes]:
-    files = streamed_sog.encode_files(scene, DEFAULTS, SETTINGS, **more)
+    files = streamed_sog.encode_files(scene, DEFAULTS, *DIVISION, **more)
     return {name: b"".join(pieces) for name, pieces in files}
 
 
@@ -513,7 +512,7 @@ def test_opacities_above_1_are_refused() -> None:
 
 
 def test_an_output_is_read_by_its_folder_and_by_its_manifest(tmp_path: Path) -> None:
-    files = streamed_sog.encode_files(detail_scene(), DEFAULTS, SETTINGS)
+    files = streamed_sog.encode_files(detail_scene(), DEFAULTS, *DIVISION)
     size = write_files(parts_output(tmp_path / "lod-meta.json", overwrite=False), files)
     assert size == sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
     whole, levels = read_scene(tmp_path), read_parts(tmp_path / "lod-meta.json", threads=2)

@@ -366,12 +366,13 @@ def test_files_that_spark_wrote_have_no_findings(name: str) -> None:
 
 def test_streamed_sog_that_we_write_has_no_findings(tmp_path: Path) -> None:
     """Codes of SOG move splats within their bounds and out of their order."""
-    settings = DetailSettings((0.3, 0.1), chunk_splats=2_000, extent=2, min_splats=100)
+    division = 2_000, 2.0, 100
+    settings = DetailSettings((0.3, 0.1), *division)
     scene = parts.make_levels(*quick.build(random_splats(3_000, sh_degree=0)), settings)
     errors = np.arange(3) * np.ones((scene.regions, 1))
     scene = replace(scene, errors=errors, environment=random_splats(50, sh_degree=0, seed=1))
     path = tmp_path / "lod-meta.json"
-    write_files(parts_output(path, overwrite=False), streamed_sog.encode_files(scene, WriteOptions(), settings))
+    write_files(parts_output(path, overwrite=False), streamed_sog.encode_files(scene, WriteOptions(), *division))
     assert checked(path).findings == []
     assert checked(path).value_at("streamed_sog.regions") > 3
     for name in ("scene.sog", "sog/meta.json"):

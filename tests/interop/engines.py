@@ -273,7 +273,8 @@ def counts_of(file: Path) -> list[int]:
 
 
 #: How the demo scene is divided into levels, regions and chunks.
-DETAIL = DetailSettings((0.25, 0.05), chunk_splats=8_000, extent=4, min_splats=2_000)
+DIVISION = 8_000, 4.0, 2_000
+DETAIL = DetailSettings((0.25, 0.05), *DIVISION)
 
 
 @functools.cache
@@ -295,7 +296,7 @@ def sky() -> Splats:
 def written(scene: DetailScene, folder: Path, size: tuple[int, int] = SIZE) -> Shot:
     """Write a scene as Streamed SOG, and return it with a camera that sees the demo scene."""
     file = folder / MANIFEST
-    write_files(parts_output(file, overwrite=False), streamed_sog.encode_files(scene, WriteOptions(), DETAIL))
+    write_files(parts_output(file, overwrite=False), streamed_sog.encode_files(scene, WriteOptions(), *DIVISION))
     level = slice(0, int(scene.counts[:, 0].sum()))
     return Shot(file, read_scene(file).splats, cameras_around(scene.splats.center[level], *size)[1])
 
