@@ -34,7 +34,7 @@ from ..system.setting_fields import Range, setting, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import format_size, percent_of
 from ..system.untrusted import MOST, shortened
-from .command import COMMON, Command, flag, values_of
+from .command import COMMON, Command, common, flag, values_of
 from .console import Console, count_of, print_json, say
 from .option_groups import OUTPUT, OVERWRITE
 from .outputs import NAMELESS, Folder, NamedPath, is_same_place, stem_of
@@ -112,124 +112,104 @@ class BuildLodOptions:
         "", NamedPath(stdin=True, addresses=True), (), argument=True, nargs=-1, metavar="INPUT..."
     )
     merge: bool = flag(
-        "Bake all INPUTs as one scene, into the file that --output names: tiles of a city, each where its own"
-        " coordinates put it.",
+        "Bake all INPUTs, such as the tiles of a city, as one scene in their own coordinates; needs --output.",
         heading=COMMON,
     )
-    scene: Path | None = setting(
-        "Merge the files of an instances file, each where it stands there, in place of INPUTs (see docs/build-lod.md).",
+    scene: Path | None = common(
+        "Merge the files of an instances file, each at its place, instead of INPUTs (see docs/build-lod.md).",
         NamedPath(),
-        heading=COMMON,
     )
     output: Place | None = setting(
         "Output of a single input, or a folder for all outputs; - is standard output.  [default: NAME-lod.spz beside"
-        f" the input; NAME-lod.rad with --format rad, NAME-lod/{MANIFEST} with --format streamed-sog,"
-        f" NAME-lod/{TILESET} with --format 3d-tiles,"
-        " NAME-lod-refined.spz of a NAME-lod.spz with --refine]",
+        f" the input; by --format NAME-lod.rad, NAME-lod/{MANIFEST} or NAME-lod/{TILESET}; NAME-lod-refined.spz of a"
+        " NAME-lod.spz with --refine]",
         NamedPath(output=True, addresses=True),
         **OUTPUT,
     )
-    output_dir: Place | None = setting(
-        "Folder for the outputs; created if it does not exist.",
-        NamedPath(output=True, folder=True, addresses=True),
-        heading=COMMON,
+    output_dir: Place | None = common(
+        "Folder for the outputs; created if it does not exist.", NamedPath(output=True, folder=True, addresses=True)
     )
     overwrite: bool = flag(**OVERWRITE)
     skip_existing: str | None = setting(
-        "Skip inputs whose output exists already, made from the same inputs and settings, as a small file beside it,"
-        " NAME.sparklod.json, records. Files whose size and date are unchanged are not read;"
-        " --skip-existing=verify reads all, and so finds damage that left both as they were.",
+        "Skip inputs whose output was made from the same inputs and settings, which NAME.sparklod.json beside it"
+        " records. Files are compared by size and date, with --skip-existing=verify by contents.",
         (BY_DATE, VERIFY),
         heading=LARGE,
         metavar="[=verify]",
         bare=BY_DATE,
     )
-    form: str | None = setting(
-        "Format of the output. rad is what Spark streams; rad-chunked writes each chunk to a file of its own,"
-        " NAME-lod-0.radc and so on, beside NAME-lod.rad; streamed-sog is what PlayCanvas, SuperSplat and Babylon.js"
-        f" stream, {MANIFEST} and folders beside it; 3d-tiles is what CesiumJS streams, {TILESET} and a folder beside"
-        " it. A Level-of-Detail file of another format keeps its tree. "
+    form: str | None = common(
+        "Format of the output. Spark streams rad, and rad-chunked with a file for each chunk, NAME-lod-0.radc and so"
+        f" on; PlayCanvas, SuperSplat and Babylon.js stream streamed-sog, {MANIFEST} and folders; CesiumJS streams"
+        f" 3d-tiles, {TILESET} and a folder. A Level-of-Detail file of another format keeps its tree. "
         " [default: by the name of FILE, or spz]",
         tuple(TREE_FORMS),
         flags=("--format",),
-        heading=COMMON,
     )
     refine: int | None = setting(
-        "Fit merged splats to pictures of full detail, in STEPS pictures of cuts: minutes, for cuts that come closer to"
-        " it. The leaves stay as they are, and so does the tree of a Level-of-Detail file. Ctrl-C ends it early and"
-        " keeps what was gained.  [default, without STEPS: by the size of the tree]",
+        "Fit merged splats to STEPS pictures of full detail, for cuts that are closer to it; takes minutes. Leaves, and"
+        " the tree of a Level-of-Detail file, stay as they are. Ctrl-C ends it early and keeps the gain."
+        "  [default, without STEPS: by the size of the tree]",
         OptionalNumber(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS, zero=BY_SIZE),
         is_flag=False,
         flag_value=BY_SIZE,
         heading=REFINING,
     )
     camera_path: Path | None = setting(
-        "Cameras that --refine fits for, in the coordinates of the output, in any format that render reads: those of"
-        " visitors whose paths are known.  [default: cameras around and inside the scene]",
+        "Cameras that --refine fits for, in the coordinates of the output and any format that render reads."
+        "  [default: cameras around and inside the scene]",
         NamedPath(),
         heading=REFINING,
     )
     seed: int = setting(SEED_HELP, SEED, 0, heading=REFINING)
     device: str = setting(FIT_DEVICE_HELP, DEVICES, "cpu", heading=REFINING)
-    method: str | None = setting(
-        "How splats are merged: quick takes seconds; quality takes longer, and its cuts come closer to full detail."
+    method: str | None = common(
+        "How splats are merged: quick takes seconds; quality takes longer, and its cuts are closer to full detail."
         f"  [default: {METHODS[0]}; quality with --format streamed-sog or 3d-tiles]",
         METHODS,
-        heading=COMMON,
     )
     writing: Writing = field(default_factory=Writing)
     base: float = setting(
-        "Growth of the voxel grid from level to level, with --method quick. Smaller values give smoother transitions"
-        " and more nodes.",
+        "Growth of the voxel grid from level to level, with --method quick; less gives smoother transitions.",
         Range(MIN_BASE, MAX_BASE, unit="N"),
         DEFAULT_BASE,
         heading=TREE,
     )
     growth: float | None = setting(
         "Largest number of nodes for each leaf, with --method quality."
-        f"  [default: {DEFAULT_GROWTH:g}; {DETAIL_GROWTH:g} with --format streamed-sog or"
-        f" 3d-tiles]",
+        f"  [default: {DEFAULT_GROWTH:g}; {DETAIL_GROWTH:g} with --format streamed-sog or 3d-tiles]",
         Range(MIN_GROWTH, MAX_GROWTH, unit="N"),
         heading=TREE,
     )
     detail: DetailSettings = field(default_factory=DetailSettings)
     environment: Path | None = setting(
-        "Splats that are always drawn, such as a sky, from a file of any format without a tree; turned and moved as the"
-        " scene.",
+        "Splats that are always drawn, such as a sky, from a file without a tree; moved with the scene.",
         NamedPath(),
         heading=DETAIL,
     )
     environment_beyond: float | None = setting(
-        "Make splats whose centre is farther than this from the median of all centres the environment, in the input's"
-        " units.",
+        "Move splats farther than this from the median of all centres into the environment; in the input's units.",
         Range(above=0, unit="RADIUS"),
         heading=DETAIL,
     )
     tiles: TileSettings = field(default_factory=TileSettings)
     memory: int | None = setting(
-        "Memory that a bake may take, such as 4G or '600 MB'. A scene that needs more is baked out of core: block by"
-        " block, with a scratch folder.  [default: 75 % of what is available]",
+        "Memory that a bake may take, such as 4G or '600 MB'; a scene that needs more is baked out of core, block by"
+        " block.  [default: 75 % of what is available]",
         MEMORY,
         heading=LARGE,
     )
     scratch_dir: Place | None = setting(
-        "Where a bake out of core makes its scratch folder, which is removed at the end.  [default: beside the output]",
+        "Folder for the scratch folder of a bake out of core, removed at the end.  [default: beside the output]",
         NamedPath(output=True, folder=True, addresses=True),
         heading=LARGE,
     )
-    resume: bool = flag(
-        "Go on with a bake out of core that was interrupted; it must be the same bake. Without one, begin.",
-        heading=LARGE,
-    )
+    resume: bool = flag("Continue the same bake out of core where it was interrupted, if it was.", heading=LARGE)
     workers: int | None = setting(
-        "Bake on this many processes of this machine, which share --threads and --memory.",
-        whole(1, 256),
-        heading=CLUSTER,
+        "Number of processes that bake, sharing --threads and --memory.", whole(1, 256), heading=CLUSTER
     )
     scheduler: str | None = setting(
-        "Bake on the Dask cluster whose scheduler has this address, as tcp://host:8786.",
-        metavar="ADDRESS",
-        heading=CLUSTER,
+        "Address of the scheduler of a Dask cluster that bakes: tcp://host:8786.", metavar="ADDRESS", heading=CLUSTER
     )
 
 

@@ -206,8 +206,9 @@ def refuse_output_among_inputs(ctx: click.Context, *, missing: bool = False) -> 
 Options = TypeVar("Options")
 
 
-#: Makes a field that is an option without a value, see `setting`.
+#: Make fields that are options without a value, and options under `COMMON`, see `setting`.
 flag = functools.partial(setting, default=False)
+common = functools.partial(setting, heading=COMMON)
 
 
 def _parameters(group: type[Any], heading: str) -> Iterator[click.Parameter]:

@@ -13,7 +13,7 @@ from ..system.errors import FormatError, InvalidSplatsError, OutOfMemoryError, n
 from ..system.setting_fields import setting
 from ..system.stdio import DASH, name_of
 from .build_lod import report
-from .command import COMMON, Command, flag, values_of
+from .command import COMMON, Command, common, flag, values_of
 from .console import Console
 from .option_groups import OVERWRITE
 from .outputs import Folder, NamedPath, name_outputs
@@ -43,20 +43,18 @@ class ConvertOptions:
 
     source: Place = setting("", NamedPath(stdin=True, addresses=True), argument=True, metavar="IN", required=True)
     output: Place = setting("", NamedPath(output=True, addresses=True), argument=True, metavar="OUT", required=True)
-    form: str | None = setting(
+    form: str | None = common(
         "Format of OUT; rad-chunked writes each chunk of a RAD to a file of its own.  [default: by the name of OUT]",
         NAMES,
         flags=("--format",),
-        heading=COMMON,
     )
     leaves: bool = flag(
-        "Write the leaves of the tree, the original splats as the file holds them, where OUT could hold the tree.",
+        "Write the leaves of the tree, which are the original splats, even if OUT can hold the tree.",
         heading=COMMON,
     )
-    layout: str | None = setting(
-        f"Layout of the arrays in a viewer's memory that {ARRAYS[0]} has, or without names {' and '.join(ARRAYS[1:])}.",
+    layout: str | None = common(
+        f"Layout of arrays in a viewer's memory, for {ARRAYS[0]} or, without names, {' and '.join(ARRAYS[1:])}.",
         ENCODINGS,
-        heading=COMMON,
     )
     overwrite: bool = flag(**OVERWRITE)
     writing: Writing = field(default_factory=Writing)

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import click
 
 from ..images.picture_files import PLOT_BY
-from ..system.errors import CHECK_FAILED, OutOfMemoryError, SparklodError, StdoutError, memory_errors_translated
+from ..system.errors import CHECK_FAILED, OutOfMemoryError, SparklodError, memory_errors_translated
 from ..system.output import write_file
 from ..system.setting_fields import setting, whole
 from ..system.stdio import name_of
 from ..system.threads import on_threads
 from ..system.units import format_size
 from ..system.untrusted import MOST, printable, shortened
-from .command import COMMON, Command, flag, values_of
+from .command import COMMON, Command, common, flag, values_of
 from .console import Console, count_of, rows
 from .option_groups import ASSERT, EACH_AS_JSON, JSON, OVERWRITE, PNG, QUIET, General, table_output
 from .outputs import NamedPath, keep_apart, name_outputs
@@ -65,22 +65,17 @@ class Checks:
     HEADING: ClassVar[str] = "Checks"
 
     check: bool = flag(
-        "Look for everything that can be wrong, and print a line for each finding instead of a report.", heading=COMMON
+        "Search for all kinds of faults, and print a line for each finding instead of a report.", heading=COMMON
     )
-    asserts: tuple[str, ...] = setting(
-        "Expect this of every file, such as 'lod==true', 'nodes<5M', 'bytes<=40MB' or 'tree.depth<24'; can be given"
-        " several times. The exit status is 3 if it does not hold.",
+    asserts: tuple[str, ...] = common(
+        "Assert this of every file, such as 'lod==true', 'nodes<5M', 'bytes<=40MB' or 'tree.depth<24'; repeatable. The"
+        " exit status is 3 if it does not hold.",
         **ASSERT,
-        heading=COMMON,
     )
-    leaves_of: Path | None = setting(
-        "Expect the leaves to be exactly the splats of this file, within the rounding of the format.",
-        NamedPath(),
-        heading=COMMON,
+    leaves_of: Path | None = common(
+        "Assert that the leaves are the splats of this file, within the rounding of the format.", NamedPath()
     )
-    expect: Path | None = setting(
-        "Expect what a text file says, with an assertion on each line.", NamedPath(), heading=COMMON
-    )
+    expect: Path | None = common("Make the assertions of a text file, one a line.", NamedPath())
     fail_on: str = setting("Lowest severity of a finding that makes the exit status 3.", ("error", "warning"), "error")
     style: str = setting(
         "How findings are printed; github prints annotations for GitHub Actions.",
@@ -91,22 +86,19 @@ class Checks:
 
     @property
     def holds(self) -> bool:
-        return self.check or self.has_expectations or self.leaves_of is not None
-
-    @property
-    def has_expectations(self) -> bool:
-        return bool(self.asserts or self.expect)
+        """Whether files are checked, so that findings are printed in place of reports."""
+        return self.check or bool(self.asserts) or self.expect is not None or self.leaves_of is not None
 
     def expectations(self) -> list[Assertion] | None:
         """Return the assertions of the file and of the options; None without either.
 
         Raises:
-            ExpectationError: the file cannot be understood.
+            ExpectationError: a line of the file is not an assertion.
         """
         from ..inspection.report import parse_expectation, read_expectations
         from ..tables.assertions import BadAssertionError
 
-        if not self.has_expectations:
+        if not self.asserts and self.expect is None:
             return None
         try:
             given = [parse_expectation(text) for text in self.asserts]
@@ -123,20 +115,18 @@ class InspectOutput:
 
     overwrite: bool = flag(**OVERWRITE)
     stats: bool = flag("Report statistics of all quantities, not only of the main ones.", heading=COMMON)
-    field: str | None = setting(
-        "Print one value of the JSON report, such as tree.leaves, instead of a report.", metavar="NAME", heading=COMMON
+    field: str | None = common(
+        "Print one value of the JSON report, such as tree.leaves, instead of a report.", metavar="NAME"
     )
-    html: Path | None = setting(
-        "Write the reports as one HTML page, with pictures.",
-        NamedPath(output=True, suffixes=[".html", ".htm"]),
-        heading=COMMON,
+    html: Path | None = common(
+        "Write the reports as one HTML page, with pictures.", NamedPath(output=True, suffixes=[".html", ".htm"])
     )
     histogram: tuple[str, ...] = setting(
-        "Print a histogram of a quantity that --stats lists; can be given several times.", metavar="NAME", multiple=True
+        "Print a histogram of a quantity that --stats lists; repeatable.", metavar="NAME", multiple=True
     )
     chunks: bool = flag(
-        "Print a table of the chunks; with --json, put it into the report. Files without chunks have those of 65,536"
-        " splats in which a viewer would stream them."
+        "Print a table of the chunks, or add it to the report of --json; a file without chunks is divided into ones of"
+        " 65,536 splats."
     )
     chunks_out: Path | None = setting(
         "Write the table of the chunks of a single file to FILE: .csv, .json or .parquet.", NamedPath(output=True)
@@ -224,16 +214,13 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
 def _report_settings(
     checks: Checks, output: InspectOutput, expected: list[Assertion] | None, *, as_json: bool
 ) -> ReportSettings:
+    """Return what must be known of each file for what is printed, drawn and checked."""
     from ..inspection.report import HEADER_FIELDS, ReportSettings
 
     field = output.field or ""
-    about = [assertion.name for assertion in expected or ()]
-    everything = (
-        output.stats
-        or bool(output.histogram)
-        or checks.expect is not None
-        or any(name.startswith("values") for name in (field, *about))
-    )
+    about = (field, *(assertion.name for assertion in expected or ()))
+    everything = output.stats or bool(output.histogram) or checks.expect is not None
+    everything = everything or any(name.startswith("values") for name in about)
     drawn = output.html is not None or output.plot is not None
     printed = not (as_json or field or checks.holds)
     return ReportSettings(
@@ -249,7 +236,7 @@ def _report_settings(
 
 @dataclass
 class _Job:
-    """Inspection of all files with the same settings, and the sections of the page so far."""
+    """Inspection of files with the same settings, which collects the sections of the page of --html."""
 
     console: Console
     options: InspectOptions
@@ -260,6 +247,7 @@ class _Job:
     sections: list[FileSection] = dataclasses.field(default_factory=list)
 
     def inspect(self, file: Path) -> int:
+        """Report on a file, check it and draw it; return the exit status."""
         from ..api.reports import inspect_file, picture_of, thumbnail_of
 
         start, name, options, output = time.perf_counter(), name_of(file), self.options, self.options.output
@@ -281,7 +269,13 @@ class _Job:
                     picture, problem = picture_of(scene, output.plot_by, output.plot_level)
                 if picture is not None and output.plot is not None:
                     size = write_file(output.plot, [picture.png], overwrite=output.overwrite)
-                histograms = _histograms(scene, output.histogram)
+                histograms = {}
+                if scene is not None and output.histogram:
+                    from ..inspection.values import histogram_of, names_of
+                    from ..tables.histograms import as_text
+
+                    held = [each for each in output.histogram if each in names_of(scene.splats)]
+                    histograms = {each: as_text(histogram_of(scene.splats, each)) for each in held}
                 if output.html is not None:
                     from ..inspection.html import section_of
 
@@ -305,24 +299,41 @@ class _Job:
         return status
 
     def _report(self, name: str, report: Report) -> int:
-        checks = self.options.checks
+        """Print what the options ask for; return the exit status."""
+        console, options, checks, output = self.console, self.options, self.options.checks, self.options.output
+        is_read, findings = report.format is not None, report.findings or []
         status = CHECK_FAILED if checks.holds and report.fails(checks.fail_on) else 0
-        if report.format is None and not checks.holds:
+        if not is_read and not checks.holds:
             status = 1
-            for finding in report.findings or []:
-                self.console.error(f"{name}: {finding.message}")
-        try:
-            self._print(name, report)
-        except StdoutError:
-            raise  # of no file
-        except SparklodError as error:
-            self.console.error(f"{name}: {error}")
-            status = 1
-        if report.format is not None and self.settings.chunks:
-            status = max(status, self._print_chunks(name, report))
-        return status
+            for finding in findings:
+                console.error(f"{name}: {finding.message}")
+        if options.as_json:
+            click.echo(json.dumps(report.as_dict(), allow_nan=False))
+        elif output.field and is_read:
+            try:
+                value = report.value_at(output.field)
+            except SparklodError as error:
+                console.error(f"{name}: {error}")
+                status = 1
+            else:
+                click.echo(printable(value) if isinstance(value, str) else json.dumps(value))
+        elif output.field:
+            pass
+        elif checks.holds and findings:
+            for finding in findings:
+                click.echo(finding_line(name, finding, checks.style))
+        elif checks.holds or (is_read and output.html is not None and not output.stats):
+            noun = "node" if report.tree is not None else "splat"
+            counts = Counter(each.severity for each in findings)
+            verdict = ", ".join(count_of(count, severity) for severity, count in counts.items())
+            console.say(f"{name}: {verdict or f'OK: {count_of(report.splats or 0, noun)}, no problems found'}")
+            for hint in () if findings else report.hints:
+                console.say(f"{name}: {hint}")
+        elif is_read and not options.general.quiet:
+            click.echo("\n".join(lines(name, report.as_dict())))
+        return max(status, self._report_chunks(name, report)) if is_read and self.settings.chunks else status
 
-    def _print_chunks(self, name: str, report: Report) -> int:
+    def _report_chunks(self, name: str, report: Report) -> int:
         from ..inspection.report import chunk_lines
 
         if report.chunks is None:
@@ -334,30 +345,6 @@ class _Job:
             self.console.say(f"{self.table.path}  table of {count_of(len(report.chunks), 'chunk')}")
         return 0
 
-    def _print(self, name: str, report: Report) -> None:
-        plain, checks, output = report.as_dict(), self.options.checks, self.options.output
-        if self.options.as_json:
-            click.echo(json.dumps(plain, allow_nan=False))
-        elif output.field:
-            if report.format is not None:
-                value = report.value_at(output.field)
-                click.echo(printable(value) if isinstance(value, str) else json.dumps(value))
-        elif checks.holds:
-            for finding in report.findings or []:
-                click.echo(finding_line(name, finding, checks.style))
-            if not report.findings:
-                self._say_verdict(name, report)
-        elif report.format is not None and output.html is not None and not output.stats:
-            self._say_verdict(name, report)
-        elif report.format is not None and not self.options.general.quiet:
-            click.echo("\n".join(lines(name, plain)))
-
-    def _say_verdict(self, name: str, report: Report) -> None:
-        """Print the result of the check, and hints if there are no findings."""
-        self.console.say(f"{name}: {verdict(report)}")
-        for hint in () if report.findings else report.hints:
-            self.console.say(f"{name}: {hint}")
-
     def write_page(self) -> None:
         output = self.options.output
         if output.html is None:
@@ -366,17 +353,6 @@ class _Job:
 
         size = write_file(output.html, [page(self.sections).encode()], overwrite=output.overwrite)
         self.console.say(f"{output.html}  page of {count_of(len(self.sections), 'file')}, {format_size(size)}")
-
-
-def _histograms(scene: Scene | None, names: Sequence[str]) -> dict[str, str]:
-    """Return the histograms of quantities that a file has, as text."""
-    if scene is None or not names:
-        return {}
-    from ..inspection import values
-    from ..tables.histograms import as_text
-
-    held = values.names_of(scene.splats)
-    return {name: as_text(values.histogram_of(scene.splats, name)) for name in names if name in held}
 
 
 #: Numbers of children that get a row of their own.
@@ -423,6 +399,10 @@ def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
         yield from _tree(tree)
     if values:
         yield from _values(values)
+
+
+def _sizes(sizes: dict[str, int]) -> str:
+    return f"{format_size(sizes['min'])} to {format_size(sizes['max'])}, median {format_size(sizes['median'])}"
 
 
 def _rad(rad: dict[str, Any]) -> Iterator[str]:
@@ -507,10 +487,6 @@ def _tiles(tiles: dict[str, Any]) -> Iterator[str]:
         yield from rows("written by", tiles["generator"])
 
 
-def _sizes(sizes: dict[str, int]) -> str:
-    return f"{format_size(sizes['min'])} to {format_size(sizes['max'])}, median {format_size(sizes['median'])}"
-
-
 def _tree(tree: dict[str, Any]) -> Iterator[str]:
     inner = count_of(tree["inner"], "inner node")
     leaves = count_of(tree["leaves"], "leaf", "leaves")
@@ -558,15 +534,6 @@ def _values(values: dict[str, Any]) -> Iterator[str]:
         yield from rows("degenerate", bad)
 
 
-def verdict(report: Report) -> str:
-    """Return the result of a check in a few words: how many findings there are of each severity."""
-    findings = report.findings or []
-    if not findings:
-        noun = "node" if report.tree is not None else "splat"
-        return f"OK: {count_of(report.splats or 0, noun)}, no problems found"
-    return ", ".join(count_of(count, name) for name, count in Counter(each.severity for each in findings).items())
-
-
 def finding_line(file: str, found: Finding, style: str) -> str:
     """Return a finding in a line, as text or as an annotation of GitHub Actions."""
     if style == "text":
@@ -576,7 +543,7 @@ def finding_line(file: str, found: Finding, style: str) -> str:
 
 
 def _escaped(text: str, more: str = "") -> str:
-    """As workflow commands of GitHub Actions want it, which keep line ends; other marks cannot stay."""
+    """Escape a text for workflow commands of GitHub Actions: line ends are encoded, other control characters shown."""
     text = "".join(mark if mark in "\r\n" else printable(mark) for mark in text)
     for mark in "%\r\n" + more:
         text = text.replace(mark, f"%{ord(mark):02X}")

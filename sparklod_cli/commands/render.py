@@ -20,7 +20,7 @@ from ..render.render_settings import SORTINGS, RenderSettings, uses_card
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import format_size, parse_time
 from ..viewers.viewer_settings import BLEND, StreamingSettings
-from .command import COLOR, COMMON, VIEW, Command, flag, values_of
+from .command import COLOR, COMMON, VIEW, Command, common, flag, values_of
 from .console import Console, count_of, for_screen, is_terminal, print_json
 from .option_groups import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, parse_asserts, report_outcomes, table_output
 from .outputs import Folder, NamedPath, keep_apart, name_outputs, require_suffix, stem_of
@@ -67,7 +67,7 @@ MOST_SIDE = {"webp": 16_383, "jpg": 65_500}
 class PictureCameras(Cameras):
     """Options of the cameras of pictures: without a source there is one camera, and there is `--view`."""
 
-    orbit: int | None = setting(f"{AROUND_SCENE}one camera that sees the whole scene]", CAMERAS, heading=COMMON)
+    orbit: int | None = common(f"{AROUND_SCENE}one camera that sees the whole scene]", CAMERAS)
     views: tuple[Any, ...] = setting(
         "Place a camera as --look-at does; several --view make a contact sheet.", VIEW, flags=("--view",), multiple=True
     )
@@ -79,15 +79,13 @@ class PictureCameras(Cameras):
 class PictureCut(CutOptions):
     """Options of the cuts that pictures show."""
 
-    budget: tuple[Budget, ...] | None = setting(
+    budget: tuple[Budget, ...] | None = common(
         f"{MOST_DRAWN}; with --compare several, such as 5%,500k.  [default: that of --preset]",
         Quantity("N|P%,...", parse_budgets),
-        heading=COMMON,
     )
     full: bool = flag("Draw full detail: all leaves, however many there are.", heading=COMMON)
     continuous: bool = flag(
-        "Blend nodes and their children where one replaces the other, so that nothing pops; draws 18 to 40 % more"
-        " splats than the budget."
+        "Blend nodes with the children that replace them, so that nothing pops; draws 18 to 40 % more splats."
     )
     blend: float | None = setting(
         f"With --continuous: ratio of the pixel scales between which nodes blend.  [default: {BLEND:g}]", Range(above=1)
@@ -100,28 +98,23 @@ class Appearance:
 
     HEADING: ClassVar[str] = "Appearance"
 
-    background: Color | None = setting(
-        "Colour behind the splats: '#rrggbb', black, white or transparent.  [default: black]",
-        COLOR,
-        (0.0, 0.0, 0.0),
-        heading=COMMON,
+    background: Color | None = common(
+        "Colour behind the splats: '#rrggbb', black, white or transparent.  [default: black]", COLOR, (0.0, 0.0, 0.0)
     )
     alpha: bool = flag("Keep alpha, as --background transparent does.")
     render: RenderSettings = field(default_factory=RenderSettings)
     no_bar: bool = flag("Leave out the colour bar of --color-by or --diff.")
     through: str | None = setting(
-        "Draw splats as Spark's PackedSplats or ExtSplats, SPZ or RAD round them; cuts stay those of the file."
+        "Draw splats as Spark's PackedSplats or ExtSplats, SPZ or RAD round them, in cuts of the file."
         "  [default: as in the file]",
         ROUND_TRIPS,
     )
     sorting: str | None = setting(
-        "With --backend osmesa: sort exactly, or by 16 bits of the depth as antimatter15's viewer does (counting16)."
-        "  [default: exact]",
+        "With --backend osmesa: sort exactly, or by 16 bits of depth as antimatter15's viewer.  [default: exact]",
         SORTINGS,
     )
     sort_throttle: float | None = setting(
-        "With --backend osmesa: keep the order until the cosine between the view directions falls below 1 - X, such as"
-        " 0.01.  [default: 0]",
+        "With --backend osmesa: keep the order while the cosine of view directions is at least 1 - X.  [default: 0]",
         Range(0, 2),
     )
 
@@ -164,41 +157,37 @@ class RenderOptions:
     HEADING: ClassVar[str] = "Output"
 
     output: Path | Folder | None = setting(
-        "Write a .png, .jpg, .webp or .npy (floats), or with out.%04d.png one for each camera; a .mp4, .webm, .gif or"
-        " .webp for an animation; with --compare a .csv, .json or .parquet; or into the folder FILE as NAME.png; - is"
-        " standard output.  [default: NAME.png beside the first FILE; with --compare standard output]",
+        "Output: .png, .jpg, .webp or .npy (floats); out.%04d.png for a picture of each camera; .mp4, .webm, .gif or"
+        " .webp for an animation; with --compare .csv, .json or .parquet; a folder for NAME.png; - is standard output."
+        "  [default: NAME.png beside the first FILE; with --compare standard output]",
         NamedPath(output=True),
         **OUTPUT,
     )
     overwrite: bool = flag(**OVERWRITE)
     thumbnail: bool = flag(
-        f"Draw a small picture of the whole scene: {THUMBNAIL_SIZE[0]}x{THUMBNAIL_SIZE[1]} pixels, each the mean of"
-        f" {THUMBNAIL_SUPERSAMPLE} x {THUMBNAIL_SUPERSAMPLE} samples, to NAME-thumbnail.png.",
+        f"Draw the whole scene at {THUMBNAIL_SIZE[0]}x{THUMBNAIL_SIZE[1]} pixels, supersampled, as NAME-thumbnail.png.",
         heading=COMMON,
     )
     sheet: bool = flag("Put the pictures of all cameras on one contact sheet.")
-    jobs: int = setting(
-        "Number of pictures to work on at a time: while one is drawn, others are sorted and written.", whole(1, 256), 2
-    )
+    jobs: int = setting("Number of pictures to prepare, draw and write at a time.", whole(1, 256), 2)
     jpeg_quality: int = setting("Quality of a .jpg, from 1 to 100.", whole(1, 100), JPEG_QUALITY)
     inputs: Inputs = field(default_factory=Inputs)
     cameras: PictureCameras = field(default_factory=PictureCameras)
     cut: PictureCut = field(default_factory=PictureCut)
     after: float | None = setting(
-        "Draw what a visitor sees this long after opening a page with the files, such as 500ms, who waits in front of"
-        " the camera; with --bandwidth.  [default: what is drawn once every chunk has arrived]",
+        "Draw what the camera sees this long after a page with the files was opened, such as 500ms; with --bandwidth."
+        "  [default: when every chunk has arrived]",
         Quantity("TIME", parse_time),
         heading=StreamingSettings.HEADING,
     )
     streaming: StreamingSettings = field(default_factory=StreamingSettings)
     appearance: Appearance = field(default_factory=Appearance)
     compare: bool = flag(
-        "Measure how far the cuts of each --budget are from full detail, as a table instead of pictures.",
+        "Measure how cuts of each --budget differ from full detail, in a table instead of pictures.",
         heading=COMPARISON,
     )
     asserts: tuple[str, ...] = setting(
-        "With --compare: a condition that must hold, such as 'psnr_min>30', or '5%:psnr>30' for one of the budgets; the"
-        " exit status is 3 if it does not.",
+        "With --compare: condition, such as 'psnr_min>30', or '5%:psnr>30' of one budget; exit status 3 if it fails.",
         **ASSERT,
         heading=COMPARISON,
     )

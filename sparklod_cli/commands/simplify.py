@@ -20,7 +20,7 @@ from ..system.setting_fields import Quantity, Range, setting, setting_of, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
 from .build_lod import BY_SIZE, EXAMPLE_STEPS, QUALITY, report
-from .command import COMMON, Command, flag, values_of
+from .command import Command, common, flag, values_of
 from .console import Console
 from .option_groups import OVERWRITE
 from .outputs import NamedPath, name_outputs
@@ -48,43 +48,36 @@ class SimplifyOptions:
     inputs: tuple[Place, ...] = setting(
         "", NamedPath(stdin=True, addresses=True), (), argument=True, nargs=-1, metavar="INPUT...", required=True
     )
-    to: Budget | None = setting(
-        "Number of splats, such as 100k, or share of the INPUT's, such as 10%.",
-        Quantity("N|P%", parse_budget),
-        heading=COMMON,
+    to: Budget | None = common(
+        "Number of splats, such as 100k, or share of the INPUT's, such as 10%.", Quantity("N|P%", parse_budget)
     )
-    max_bytes: int | None = setting(
-        "Largest size of the file, such as 8MB: as many splats as fit into its format.",
+    max_bytes: int | None = common(
+        "Largest size of the file, such as 8MB, which keeps as many splats as fit.",
         Quantity("SIZE", parse_size, whole(1)),
-        heading=COMMON,
     )
-    psnr: float | None = setting(
-        "PSNR in dB that pictures have against the INPUT's, such as 40: as few splats as hold it.",
+    psnr: float | None = common(
+        "Least PSNR of pictures against the INPUT's in dB, such as 40, which keeps as few splats as reach it.",
         Range(above=0, below=100, unit="DB"),
-        heading=COMMON,
     )
-    camera_path: Path | None = setting(
-        "Cameras that --psnr is measured with and --refine fits for, in the coordinates of the output, in any format"
-        " that render reads.  [default: cameras around and inside the scene]",
+    camera_path: Path | None = common(
+        "Cameras of --psnr and --refine, in the coordinates of the output and any format that render reads."
+        "  [default: cameras around and inside the scene]",
         NamedPath(),
-        heading=COMMON,
     )
-    refine: int | None = setting(
-        "Fit the splats to pictures of the INPUT, in STEPS pictures: a minute or more, for some dB."
+    refine: int | None = common(
+        "Fit the splats to STEPS pictures of the INPUT, which takes a minute or more and gains some dB."
         "  [default, without STEPS: by the size of the scene]",
         OptionalNumber(STEPS, placeholder="STEPS", example=EXAMPLE_STEPS, zero=BY_SIZE),
         is_flag=False,
         flag_value=BY_SIZE,
-        heading=COMMON,
     )
     seed: int = setting_of(FitSettings, "seed")
     device: str = setting_of(FitSettings, "device")
-    output: Place = setting(
+    output: Place = common(
         "Output, whose name chooses the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .glb, .rad or"
-        " .splat, which has no SH; DIR/ means DIR/NAME-small.spz, - standard output, as SPZ.",
+        " .splat (without SH); DIR/ is DIR/NAME-small.spz, - is standard output, as SPZ.",
         NamedPath(output=True, addresses=True),
         flags=("-o", "--output"),
-        heading=COMMON,
         required=True,
     )
     overwrite: bool = flag(**OVERWRITE)

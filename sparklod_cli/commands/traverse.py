@@ -18,7 +18,7 @@ from ..system.units import format_size, percent_of
 from ..system.untrusted import printable
 from ..tables.columns import FORMS
 from ..viewers.viewer_settings import StreamingSettings
-from .command import COMMON, Command, flag, values_of
+from .command import COMMON, Command, common, flag, values_of
 from .console import WIDTH, Console, count_of, for_screen, is_terminal, print_json, rows
 from .option_groups import ASSERT, JSON, OUTPUT, OVERWRITE, PNG, General, parse_asserts, report_outcomes, table_output
 from .outputs import NamedPath, keep_apart, name_outputs
@@ -53,30 +53,25 @@ class TraverseOptions:
     HEADING: ClassVar[str] = "Output"
 
     output: Path | None = setting(
-        "Write the table to FILE: .csv, .json or .parquet; - is standard output.  [default: standard output, but for a"
-        " terminal, which gets the summary]",
+        "Output of the table: .csv, .json or .parquet; - is standard output.  [default: standard output; a terminal"
+        " gets the summary]",
         NamedPath(output=True),
         **OUTPUT,
     )
     overwrite: bool = flag(**OVERWRITE)
-    summary: bool | None = setting(
+    summary: bool | None = common(
         "Print a summary of the frames on standard error.  [default: if that is a terminal]",
         flags=("--summary/--no-summary",),
-        heading=COMMON,
     )
-    asserts: tuple[str, ...] = setting(
-        "Condition that must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.",
-        **ASSERT,
-        heading=COMMON,
+    asserts: tuple[str, ...] = common(
+        "Condition that must hold, such as 'churn_p95<0.2'; the exit status is 3 if it does not.", **ASSERT
     )
-    plot: Path | None = setting("Draw charts of the table and the path over the scene, as a .png.", PNG, heading=COMMON)
+    plot: Path | None = common("Draw charts of the table and the path over the scene, as a .png.", PNG)
     form: str | None = setting(
         "Format of the table.  [default: by the suffix of --output, or csv]", tuple(FORMS), flags=("--format",)
     )
     per_instance: bool = flag("Write a row for each instance, besides that of all together.")
-    no_timing: bool = flag(
-        "Leave out traverse_ms, the time that each traversal took, so that two runs write the same bytes."
-    )
+    no_timing: bool = flag("Leave out traverse_ms, the time of each traversal, so that two runs write the same bytes.")
     indices_out: Path | None = setting(
         "Write the nodes of every cut to DIR, as .npy of uint32.", NamedPath(output=True, folder=True)
     )

@@ -16,7 +16,7 @@ from ..lod.budget import doubt
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import format_size, parse_count
 from ..system.untrusted import printable
-from .command import COMMON, DIRECTION, VIEW, Command, flag, values_of
+from .command import COMMON, DIRECTION, VIEW, Command, common, flag, values_of
 from .console import Console, count_of, print_json
 from .option_groups import DEFAULT_UP, JSON, OVERWRITE, QUIET, UP, VERBOSE, General
 from .outputs import NamedPath, keep_apart
@@ -43,26 +43,20 @@ class _Page:
 
     HEADING: ClassVar[str] = "Page"
 
-    look_at: Any = setting(
-        "Place the camera at EYE, looking at TARGET, each x,y,z.  [default: it sees the whole scene]",
-        VIEW,
-        heading=COMMON,
+    look_at: Any = common(
+        "Place the camera at EYE, looking at TARGET, each x,y,z.  [default: it sees the whole scene]", VIEW
     )
-    camera_path: Path | None = setting(
-        "Play the cameras of a file, or of a folder written by COLMAP.", NamedPath(), heading=COMMON
-    )
-    spark_dir: Path | None = setting(
-        "Take Spark, PlayCanvas or CesiumJS, and three.js from the node_modules of a folder.  [default: from a CDN, but"
-        " for CesiumJS]",
+    camera_path: Path | None = common("Play the cameras of a file, or of a folder written by COLMAP.", NamedPath())
+    spark_dir: Path | None = common(
+        "Folder whose node_modules have the viewer and three.js.  [default: a CDN, but not for CesiumJS]",
         NamedPath(),
-        heading=COMMON,
         metavar="DIR",
     )
     budget: int | None = setting(
         "Most splats of trees that are drawn, such as 500k.  [default: as Spark chooses for the device]",
         Quantity("N", parse_count, whole(1)),
     )
-    up: tuple[float, float, float] | None = setting(f"{UP}{DEFAULT_UP}]", DIRECTION, heading=COMMON)
+    up: tuple[float, float, float] | None = common(f"{UP}{DEFAULT_UP}]", DIRECTION)
     fov: float | None = setting(
         "Vertical field of view, in degrees.  [default: 60]", Range(above=0, below=180, unit="DEGREES")
     )
@@ -74,10 +68,8 @@ class _Place:
 
     HEADING: ClassVar[str] = "Server"
 
-    export: Path | None = setting(
-        "Write the page and the files into a folder, for any web server, in place of serving them.",
-        NamedPath(output=True, folder=True),
-        heading=COMMON,
+    export: Path | None = common(
+        "Write the page and the files into a folder, for any web server.", NamedPath(output=True, folder=True)
     )
     overwrite: bool = flag(**OVERWRITE)
     port: int = setting("Port to listen on.", whole(0, 65_535), 0, show_default="any that is free")

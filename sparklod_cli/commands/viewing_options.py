@@ -21,7 +21,7 @@ from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.units import check_grouping
 from ..system.untrusted import printable
 from ..viewers.viewer_settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS, LodSettings, Network
-from .command import COMMON, DIRECTION, POINT, SIZE, VIEW, VIEWS, flag
+from .command import DIRECTION, POINT, SIZE, VIEW, VIEWS, common, flag
 from .console import Console
 from .option_groups import DEFAULT_UP, UP, General
 from .outputs import NamedPath, file_of
@@ -53,24 +53,21 @@ class Cameras:
 
     HEADING: ClassVar[str] = "Cameras"
 
-    camera_path: Path | None = setting(
-        "Read the cameras from a file, or from a folder written by COLMAP.", NamedPath(), heading=COMMON
-    )
-    orbit: int | None = setting(f"{AROUND_SCENE}an orbit of {ORBIT}]", CAMERAS, heading=COMMON)
-    look_at: Any = setting("Place one camera at EYE that looks at TARGET, each x,y,z.", VIEW, heading=COMMON)
-    size: tuple[int, int] | None = setting(
+    camera_path: Path | None = common("Read the cameras from a file, or from a folder written by COLMAP.", NamedPath())
+    orbit: int | None = common(f"{AROUND_SCENE}an orbit of {ORBIT}]", CAMERAS)
+    look_at: Any = common("Place one camera at EYE that looks at TARGET, each x,y,z.", VIEW)
+    size: tuple[int, int] | None = common(
         "Width and height of the images, in pixels; the vertical field of view is kept."
         f"  [default: the file's, or {DEFAULT_SIZE[0]}x{DEFAULT_SIZE[1]}]",
         SIZE,
-        heading=COMMON,
     )
     dolly: bool = flag("Move the camera straight towards the scene, from far to near.")
     keyframes: Any = setting(
         "Move the camera smoothly through two or more views, separated by spaces or semicolons.", VIEWS
     )
     camera_format: str | None = setting(
-        f"Format of --camera-path: {', '.join(form.name for form in FORMATS)}, or auto, which recognises it by its"
-        " content.  [default: auto]",
+        f"Format of --camera-path: auto, by its content, or {', '.join(form.name for form in FORMATS)}."
+        "  [default: auto]",
         ("auto", *(form.name for form in FORMATS)),
         metavar="FORMAT",
     )
@@ -83,7 +80,7 @@ class Cameras:
         "Point that --orbit and --dolly look at.  [default: the middle of the scene]", POINT
     )
     distance: float | None = setting(
-        "Distance from that point, in world units: of --orbit, and of the first camera of --dolly."
+        "Distance from that point, in world units; of --dolly, that of its first camera."
         "  [default: where the scene fits the image; 4 times that with --dolly]",
         Range(above=0, unit="D"),
     )
@@ -91,22 +88,20 @@ class Cameras:
         f"Angle of --orbit and --dolly above that point, in degrees.  [default: {ELEVATION:g}]",
         Range(-89, 89, unit="DEGREES"),
     )
-    up: tuple[float, float, float] | None = setting(
+    up: tuple[float, float, float] | None = common(
         f"{UP} For cameras of which only eye and target are known.{DEFAULT_UP}; y in SuperSplat's camera files]",
         DIRECTION,
-        heading=COMMON,
     )
     world_transform: str | None = setting(
-        "Transform from the world of the cameras to that of the splats: 16 numbers with commas between, row by row, or"
-        " a file of them.",
+        "Transform from the cameras' world to the splats': 16 numbers with commas, row by row, or a file of them.",
         metavar="MATRIX",
     )
     fov: float | None = setting(
         "Vertical field of view, in degrees.  [default: the file's, or 60]", Range(above=0, below=180, unit="DEGREES")
     )
     seconds: float | None = setting(
-        "Duration of --orbit, of --dolly, and of --keyframes from one view to the next, in seconds.  [default: 2; of"
-        " --orbit, N frames at --fps]",
+        "Duration of --orbit, --dolly, or --keyframes from view to view, in seconds.  [default: 2; of --orbit, N"
+        " frames at --fps]",
         Range(above=0, most=1e6, unit="S"),
     )
     fps: float | None = setting(
@@ -212,8 +207,8 @@ class CutOptions:
 
     HEADING: ClassVar[str] = "Cut"
 
-    budget: tuple[Budget, ...] | None = setting(
-        f"{MOST_DRAWN}.  [default: that of --preset]", Quantity("N|P%", parse_budgets), heading=COMMON
+    budget: tuple[Budget, ...] | None = common(
+        f"{MOST_DRAWN}.  [default: that of --preset]", Quantity("N|P%", parse_budgets)
     )
     preset: str | None = setting(
         "Budget of a device: Spark 2's, or that of Spark's LoD design with preview-desktop and mobile."
@@ -223,10 +218,10 @@ class CutOptions:
     lod_splat_scale: float = setting("Factor by which the budget is multiplied.", Range(above=0), 1.0)
     lod: LodSettings = field(default_factory=LodSettings)
     cone_fov0: float = setting(
-        "Full angle of the inner foveation cone, in degrees: full priority inside it.", DEGREES, CONE_FOV0
+        "Full angle of the inner foveation cone, inside which priority is full, in degrees.", DEGREES, CONE_FOV0
     )
     cone_fov: float = setting(
-        "Full angle of the outer cone, in degrees, where priority has fallen to --cone-foveate.", DEGREES, CONE_FOV
+        "Full angle of the outer cone, at which priority is --cone-foveate, in degrees.", DEGREES, CONE_FOV
     )
     cone_foveate: float = setting(f"Priority of nodes at the outer cone, {PRIORITY}.", FACTOR, CONE_FOVEATE)
     outside_foveate: float | None = setting(
@@ -236,9 +231,8 @@ class CutOptions:
         f"Priority of nodes behind the camera.  [default: {BEHIND_FOVEATE:g}; 1 with --outside-foveate]", FACTOR
     )
     precision: str = setting(
-        "Precision of the centres and sizes that cuts are found with: the file's, its half floats, or what Spark has of"
-        " the file, for the same cuts to the last node: ext with extSplats, else packed, or packed-pages of a RAD file"
-        " that it streams.",
+        "Precision of centres and sizes of nodes: the file's, half floats, or Spark's, for the same cuts to the last"
+        " node: ext with extSplats, else packed, or packed-pages of a RAD file that it streams.",
         PRECISIONS,
         PRECISIONS[0],
     )

@@ -30,7 +30,7 @@ from ..system.addresses import Place
 from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.stdio import DASH
 from ..system.units import parse_size
-from .command import BALL, COMMON, POINT, flag
+from .command import BALL, COMMON, POINT, common, flag
 from .option_groups import JSON, General
 from .outputs import Folder, NamedPath, keep_apart, require_suffix
 from .rules import check, flag_of, is_set
@@ -135,12 +135,8 @@ def check_outputs(
 class SceneOptions:
     """Options of which splats of the input are kept, and how the scene is turned, scaled and moved."""
 
-    min_opacity: float = setting(
-        "Leave out splats whose opacity is lower than this.", Range(0, 1, unit="N"), 0.0, heading=COMMON
-    )
-    within: Any = setting(
-        "Leave out splats whose centre is outside this ball, in the input's coordinates.", BALL, heading=COMMON
-    )
+    min_opacity: float = common("Leave out splats whose opacity is lower than this.", Range(0, 1, unit="N"), 0.0)
+    within: Any = common("Leave out splats whose centre is outside this ball, in the input's coordinates.", BALL)
     min_box: tuple[float, ...] | None = setting(
         "Leave out splats whose centre is below this on any axis, in the input's coordinates.", POINT, heading=SELECTION
     )
@@ -148,34 +144,29 @@ class SceneOptions:
         "Leave out splats whose centre is above this on any axis, in the input's coordinates.", POINT, heading=SELECTION
     )
     on_invalid: str = setting(
-        "Whether to fail on invalid splats or leave them out: numbers that are not finite, negative scales.",
+        "Fail on invalid splats (numbers that are not finite, negative scales), or leave them out.",
         ("error", "drop"),
         "error",
         heading=SELECTION,
     )
     rgba: Path | None = setting(
-        "Replace colours and opacities by those of a .npy or raw file of (N, 4) bytes or floats 0..1; splats of alpha 0"
-        " are left out.",
+        "Replace colours and opacities by a .npy or raw file of (N, 4) bytes or floats 0..1; alpha 0 drops a splat.",
         NamedPath(),
         heading=SELECTION,
     )
-    up: str | None = setting(
-        "Axis that is up in the input: turn it to +y, and note that in the output for render, traverse and view."
-        " y turns nothing; scenes as trained are mostly -y.  [default: note what the file says, and turn nothing]",
+    up: str | None = common(
+        "Axis that is up in the input, mostly -y as trained: turn it to +y, and note that in the output."
+        "  [default: note what the file says, and turn nothing]",
         UP_AXES,
-        heading=COMMON,
     )
     rotate: tuple[float, ...] = setting(
-        "Turn the scene by these angles in degrees, about x, then y, then z, after --up.  [default: 0,0,0]",
+        "Turn the scene by these angles about x, then y, then z, in degrees, after --up.  [default: 0,0,0]",
         POINT,
         (0.0, 0.0, 0.0),
         heading=POSITION,
     )
     scale: float = setting(
-        "Multiply the size of the scene by this, about its origin, after --rotate.",
-        Range(above=0),
-        1.0,
-        heading=POSITION,
+        "Factor by which the scene is scaled about its origin, after --rotate.", Range(above=0), 1.0, heading=POSITION
     )
     translate: tuple[float, ...] = setting(
         "Move the scene by this, in world units, after --scale.  [default: 0,0,0]",
@@ -214,15 +205,13 @@ class OptionalNumber(click.IntRange):
 class Writing:
     """Options of each command that writes scenes: of the splats, of the format and of messages."""
 
-    max_sh: int = setting(
-        "Highest degree of spherical harmonics to keep.", whole(0, MAX_SH_DEGREE), MAX_SH_DEGREE, heading=COMMON
-    )
+    max_sh: int = common("Highest degree of spherical harmonics to keep.", whole(0, MAX_SH_DEGREE), MAX_SH_DEGREE)
     scene: SceneOptions = field(default_factory=SceneOptions)
     written: WriteOptions = field(default_factory=WriteOptions)
     cluster_sh: int | None = setting(
-        "Write spherical harmonics to RAD as a palette of at most N entries, 2 to 65,536, and a label for each splat:"
-        " the file gets smaller, and reflections less exact. N is 65,536 if it is left out. SOG always has a palette;"
-        " this chooses its size, which otherwise suits the number of splats.",
+        "Write spherical harmonics to RAD as a palette of at most N entries, 2 to 65,536 (the default), which makes"
+        " files smaller and reflections less exact. SOG always has a palette, which otherwise suits the number of"
+        " splats.",
         OptionalNumber(SH_CODES, example=MAX_SH_CODES),
         is_flag=False,
         flag_value=str(MAX_SH_CODES),
