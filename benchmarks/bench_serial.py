@@ -81,7 +81,7 @@ class Meter:
 def bake(arguments: list[str]) -> None:
     """Bake in this process and print what its stages and compiled loops took, as JSON."""
     meter = Meter()
-    from sparklod_cli.bake.tree_output import BuiltTree
+    from sparklod_cli.bake.built_tree import BuiltTree
     from sparklod_cli.cli import main
     from sparklod_cli.system.jit import Kernel
 

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..bake.built_tree import select, transformed
 from ..bake.flow import bake
-from ..bake.in_memory import select, transformed
 from ..bake.settings import Baked, BakeSettings
 from ..bake.simplifying import leaves_of
 from ..codecs.formats import NPZ, WRITABLE

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterable
 
-from ..bake.in_memory import build_tree, select
+from ..bake.built_tree import build_tree, select
 from ..bake.settings import BakeSettings
 from ..bake.simplifying import SimplifyGoal, leaves_of, refined, simplified
 from ..cameras.camera import Camera

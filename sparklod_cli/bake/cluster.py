@@ -1,6 +1,6 @@
-"""Dask clusters: an engine that runs tasks on them, with retries and reports of lost workers, and the code of workers.
+"""Dask clusters: an engine that runs tasks with retries and reports of lost workers, and the code of the workers.
 
-A cluster is a running one, or processes on this machine that are started and ended with a bake.
+A cluster is already running, or consists of processes on this machine that start and end with a bake.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import errno
 import functools
+import itertools
 import logging
 import os
 import pickle
@@ -22,6 +23,7 @@ import uuid
 import warnings
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +56,7 @@ ALONE_SECONDS = 10.0
 #: Error numbers that repeating a call does not help: no room, no permission.
 LASTING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.ENAMETOOLONG}
 
-#: Seconds to wait for the message of a nanny that ended a worker for its memory; it may come after the loss.
+#: Seconds to wait for the message of a nanny that ended a worker for its memory; it may arrive after the loss.
 NANNY_DELAY = 3.0
 
 #: Topics of the scheduler's messages about workers, and of the nannies' about memory.
@@ -79,8 +81,8 @@ LESS_MEMORY = (
 class ClusterEngine:
     """Engine on a Dask cluster, which reports lost workers to the user by `say`.
 
-    The client holds the graph: a task is submitted when all its needs are done. Workers return two numbers only, so a
-    lost worker takes no result with it: results are in the store.
+    This process holds the graph: it submits a task when all its needs are done. Results are in the store, so that no
+    lost worker loses one.
 
     Attributes:
         client: the `distributed.Client` of the cluster.
@@ -114,7 +116,7 @@ class ClusterEngine:
             raise SparklodError(GONE) from None
 
     def look(self) -> None:
-        """Report lost workers, and a cluster without workers; raise a `SparklodError` without a scheduler."""
+        """Report lost workers and a cluster without workers; raise `SparklodError` if the scheduler does not answer."""
         self.tell_losses()
         if not self.alive:
             raise SparklodError(GONE)
@@ -128,15 +130,14 @@ class ClusterEngine:
 
     def tell_losses(self) -> None:
         """Report lost workers and the tasks that are repeated."""
-        with contextlib.suppress(queue.Empty):
-            while True:
-                lost = self._losses.get_nowait()
-                keys = lost.get("processing-tasks") or ()
-                names = sorted(str(key[-1] if isinstance(key, tuple) else key) for key in keys)
-                again = f"; to be done again: {', '.join(names[:LISTED])}" if names else ""
-                again += f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
-                why = "ran out of memory" if lost["worker"] in self._starved else "was lost"
-                self.say(f"worker {lost['worker']} {why}{again}")
+        while not self._losses.empty():  # only this thread takes one
+            lost = self._losses.get()
+            keys = lost.get("processing-tasks") or ()
+            names = sorted(str(key[-1] if isinstance(key, tuple) else key) for key in keys)
+            again = f"; to be done again: {', '.join(names[:LISTED])}" if names else ""
+            again += f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+            why = "ran out of memory" if lost["worker"] in self._starved else "was lost"
+            self.say(f"worker {lost['worker']} {why}{again}")
 
     def failure(self, name: str, future: Any) -> Exception:
         """Return the error of a failed call."""
@@ -160,7 +161,7 @@ class ClusterEngine:
         return error
 
     def keep(self, event: tuple[float, Any]) -> None:
-        """Record a message of the scheduler; called on the client's thread."""
+        """Record a message of the scheduler, on the client's thread."""
         message = event[1]
         if not isinstance(message, dict):
             return
@@ -183,32 +184,22 @@ class ClusterEngine:
             self.check(store)
             self._checked = here
         packed = pickle.dumps(job)
-        needs = {name: {need for need in task.needs if need in left} for name, (_, task) in left.items()}
-        heirs: dict[str, list[str]] = {}
-        for name, names in needs.items():
-            for need in names:
-                heirs.setdefault(need, []).append(name)
+        graph = TopologicalSorter({name: set(task.needs) & left.keys() for name, (_, task) in left.items()})
+        graph.prepare()
         with Pool(self, stage) as pool:
-
-            def submit(name: str) -> None:
-                place, task = left[name]
-                pool.submit(name, place, run_task, packed, task, self.threads)
-
-            for name in [name for name, names in needs.items() if not names]:
-                submit(name)
-            while pool:
+            while graph:
+                for name in graph.get_ready():
+                    place, task = left[name]
+                    pool.submit(name, place, run_task, packed, task, self.threads)
                 name, result, error = pool.next()
                 if error is None:
                     written, read = result
                     store.count_bytes(written=written, read=read)
                 elif not store.has(name):
                     raise error
+                graph.done(name)
                 done += left[name][1].weight
                 progress(stage, done, total, "splat")
-                for heir in heirs.get(name, ()):
-                    needs[heir].discard(name)
-                    if not needs[heir]:
-                        submit(heir)
 
     @contextlib.contextmanager
     def map_calls(
@@ -221,7 +212,7 @@ class ClusterEngine:
             unit: word for a call in the progress.
 
         Yields:
-            the result of each call, in their order, or the `SparklodError` that it failed with.
+            an iterator over the result or the `SparklodError` of each call, in order.
         """
         with Pool(self, stage) as pool:
             for place, each in enumerate(arguments):
@@ -235,16 +226,16 @@ class ClusterEngine:
                         name, result, error = pool.next()
                         if error is not None and not isinstance(error, SparklodError):
                             raise error
-                        ended[name] = result if error is None else error
+                        ended[name] = error or result
                     yield ended.pop(str(place))
 
             yield outcomes()
 
     def check(self, store: Store | None, files: Sequence[Place] = ()) -> None:
-        """Raise a `SparklodError` if a worker has another sparklod, or does not see the store or the files.
+        """Raise `SparklodError` if a worker has another version, or does not see the store or input files.
 
         Args:
-            files: that tasks read; tasks report those missing on this machine.
+            files: inputs; one that is missing on this machine is reported by the task that reads it.
         """
         here = [file for file in files if isinstance(file, Path) and file.exists()]
         name = f"{PROBE}/{uuid.uuid4().hex}"
@@ -274,7 +265,7 @@ class ClusterEngine:
 
 
 class Pool:
-    """Calls on a cluster that have not ended. A context manager, which cancels unfinished calls."""
+    """Unfinished calls on a cluster, which the context cancels at its end."""
 
     def __init__(self, engine: ClusterEngine, stage: str) -> None:
         self._engine = engine
@@ -294,11 +285,8 @@ class Pool:
             with contextlib.suppress(Exception):  # the scheduler is gone by now
                 self._engine.client.cancel(list(self._futures.values()), force=True)
 
-    def __bool__(self) -> bool:
-        return bool(self._calls)
-
     def submit(self, name: str, place: int, *call: Any) -> None:
-        """Submit a call of a function with arguments, by a unique name; calls with lower places come first."""
+        """Submit a call of a function with arguments, under a unique name; calls with lower places run first."""
         self._calls[name] = place, call
         key = (f"{self._prefix}-{self._tries.get(name, 0)}", name)
         with self._engine.guarded():
@@ -307,20 +295,19 @@ class Pool:
         future.add_done_callback(lambda _: self._ended.put(name))
 
     def next(self) -> tuple[str, Any, Exception | None]:
-        """Wait for a call that ends; return its name, its result and its error, if it failed."""
+        """Wait until a call ends; return its name and its result, or the error with which it failed."""
         while True:
-            due = [name for when, name in self._paused if when <= time.monotonic()]
-            self._paused = [each for each in self._paused if each[1] not in due]
-            for name in due:
-                place, call = self._calls[name]
-                self.submit(name, place, *call)
+            for due in [each for each in self._paused if each[0] <= time.monotonic()]:
+                self._paused.remove(due)
+                place, call = self._calls[due[1]]
+                self.submit(due[1], place, *call)
             try:
                 name = self._ended.get(timeout=TICK)
             except queue.Empty:
                 self._engine.look()
                 continue
             status = self._futures[name].status
-            if status not in ENDED:  # its worker was lost since; the scheduler repeats it
+            if status not in ENDED:  # its worker has been lost since, and the scheduler repeats it
                 self._engine.look()
                 loop = self._engine.client.loop
                 loop.add_callback(loop.call_later, TICK, self._ended.put, name)
@@ -340,30 +327,28 @@ class Pool:
             self._paused.append((time.monotonic() + PAUSES[tried], name))
 
 
-#: Result of a probe, and its array.
+#: Name of the results of probes, and of their array.
 PROBE = "probe"
 
 
 def probe(store: Store | None, name: str, files: Sequence[Path]) -> tuple[str, str, str]:
-    """Try on a worker to see files, to write a result, and to read the result that the client wrote.
+    """Check on a worker that it sees files, can write results, and can read the result that the client wrote.
 
     Returns:
-        version of sparklod, host, and what is wrong, as the end of a sentence; empty if nothing is.
+        version of sparklod, host, and the fault as the end of a sentence, empty without one.
     """
     missing, fault = [str(path) for path in files if not path.exists()], ""
     if missing:
         fault = f"does not see {', '.join(missing)}: put inputs into a folder that all machines share, or at a URL"
     if store is not None:
-        mine = f"{name}-{uuid.uuid4().hex}"
+        mine, reads = f"{name}-{uuid.uuid4().hex}", False
         try:
             store.put(mine, {PROBE: np.arange(2)})
             store.remove(mine)
         except Exception as error:
             fault = f"cannot write to {store}: {type(error).__name__}: {error}"
-        try:
+        with contextlib.suppress(Exception):
             reads = store.has(name) and len(store.get(name)[PROBE]) > 0
-        except Exception:
-            reads = False
         if not reads:
             fault = (
                 f"does not see what was written to {store}: give --scratch-dir a folder that all machines share, or a"
@@ -373,13 +358,13 @@ def probe(store: Store | None, name: str, files: Sequence[Path]) -> tuple[str, s
 
 
 def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
-    """Run a task on a worker, unless its result exists: another worker may have been lost after putting the result.
+    """Run a task on a worker, unless a worker that was lost has left its result.
 
     Args:
         packed: pickled job; each task unpickles its own, so that it counts its own bytes.
 
     Returns:
-        bytes that the task wrote to the store, and read from it.
+        number of bytes that the task wrote to the store, and read from it.
     """
     job = pickle.loads(packed)
     if not job.store.has(task.name):
@@ -390,7 +375,7 @@ def run_task(packed: bytes, task: Task, threads: int) -> tuple[int, int]:
 
 
 def dask_setup(worker: Any) -> None:
-    """Prepare a worker process started here: it has no dashboard, and the client ends it, not Ctrl-C."""
+    """Stop the dashboard of a worker process of this machine, and leave Ctrl-C to the client."""
     worker.http_server.stop()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
@@ -402,13 +387,13 @@ ANSWER_SECONDS = 30
 #: How often a task is repeated on another worker after one was lost with it.
 LOSSES = 2
 
-#: Share of the machine's free memory at which a worker started here is ended, before the system ends another process.
+#: Share of the machine's free memory at which a worker started here ends, before the system ends another process.
 MEMORY_SHARE = 0.9
 
 #: Share of the memory of a worker of a running cluster for its tasks: Dask pauses it at 0.8 and ends it at 0.95.
 TASK_SHARE = 0.7
 
-#: Bytes of a process that has read nothing: Python, Dask, numba and compiled kernels.
+#: Bytes of a process before it reads inputs: Python, Dask, numba and compiled kernels.
 LEAST_MEMORY = 500_000_000
 
 #: Dask configuration of processes started here.
@@ -446,7 +431,7 @@ def cluster(
     memory: int | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Iterator[ClusterEngine]:
-    """Yield an engine on a cluster, which is ended with the context if it was started here.
+    """Connect to a cluster, or start one for the duration of the context, and yield its engine.
 
     Args:
         scheduler: address of a running cluster, as tcp://host:8786; None starts processes on this machine.
@@ -471,7 +456,6 @@ def cluster(
         else:
             threads = threads or 1
             client = stack.enter_context(_connected(scheduler))
-            # The least memory of all workers, and --memory.
             known = client.scheduler_info()["workers"].values()
             limits = [each["memory_limit"] // each["nthreads"] for each in known if each["memory_limit"]]
             shares = [int(TASK_SHARE * each) for each in limits]
@@ -494,7 +478,7 @@ def cluster(
 
 @contextlib.contextmanager
 def _connected(address: str) -> Iterator[Any]:
-    """Yield a client of a running cluster."""
+    """Connect to a running cluster, and yield the client."""
     from distributed import Client
 
     whole = address if "://" in address else f"tcp://{address}"
@@ -518,9 +502,9 @@ def _connected(address: str) -> Iterator[Any]:
 
 
 def _credentials(address: str) -> Any:
-    """Return the certificates that Dask's configuration names; fail if they are missing or unreadable.
+    """Read the certificates that Dask's configuration names; fail if they are missing or unreadable.
 
-    Without this check, Dask fails at the end of the process, after a minute.
+    Without this check, Dask fails a minute later, at the end of the process.
     """
     from distributed import Security
 
@@ -536,17 +520,17 @@ def _credentials(address: str) -> Any:
 
 @contextlib.contextmanager
 def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
-    """Yield a client of processes on this machine. They answer no other client: other users reach their ports."""
+    """Start processes on this machine, and yield their only client: certificates keep other users off the ports."""
     import dask
     from distributed import Client, LocalCluster, Security
 
     with optional_import("--workers needs cryptography", "cluster"):
-        security = Security.temporary()  # for this cluster alone; workers get the key through pipes
+        security = Security.temporary()  # for this cluster only; workers get the key through pipes
     with contextlib.ExitStack() as stack:
         check_current_folder()
-        stack.enter_context(safe_path())  # until the end, as lost workers are started again
+        stack.enter_context(safe_path())  # until the end, as lost workers start again
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sparklod-"))
-        # An argument of LocalCluster reaches its workers only, and the scheduler has a folder, too.
+        # Set here, as an argument of LocalCluster would not reach the scheduler, which has a folder, too.
         stack.enter_context(dask.config.set(OWN_CONFIG | {"temporary-directory": folder}))
         try:
             own = LocalCluster(
@@ -570,7 +554,7 @@ def _started(workers: int, threads: int, memory: int | None) -> Iterator[Any]:
 
 
 def _end(own: Any) -> None:
-    """End workers and their tasks: all results needed are in the store."""
+    """End workers with their tasks; results that are needed are in the store."""
     for nanny in list(own.workers.values()):
         process = getattr(getattr(nanny, "process", None), "process", None)
         nanny.auto_restart = False
@@ -582,14 +566,14 @@ def _end(own: Any) -> None:
 
 
 def _memory_limit(workers: int, memory: int | None) -> int:
-    """Return the memory at which a worker started here is ended: its share of --memory, or of free memory if more."""
+    """Return the memory limit of a worker started here: its share of --memory, or of free memory if that is more."""
     free = machine.available_memory() or 0
     return max(LEAST_MEMORY, max(memory or 0, int(MEMORY_SHARE * free)) // workers)
 
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence Dask's own messages; the engine reports worker and scheduler problems itself."""
+    """Silence the messages of Dask; the engine itself reports problems of workers and the scheduler."""
     names = [name for name in logging.Logger.manager.loggerDict if name.partition(".")[0] in TALKERS]
     before = {name: logging.getLogger(name).level for name in names}
     for name in names:
@@ -621,19 +605,15 @@ def bake_side_by_side(
         resources: of a worker.
 
     Yields:
-        the result of each scene, a `Baked` or a `SparklodError`, in their order; `LARGE` for a scene that a worker has
-        no memory for.
+        the `Baked` or the `SparklodError` of each scene, in order; `LARGE` for a scene that exceeds a worker's memory.
     """
     small = [_fits_in_memory(source, settings, resources.memory) for source, _ in pairs]
+    # Workers have working folders of their own.
     settings = dataclasses.replace(settings, **{name: path.absolute() for name, path in settings.files.items()})
-    sources = [absolute_source(source) for source, _ in pairs]  # workers have folders of their own
-    engine.check(None, [place for source in sources for place in places_of(source)])
+    whole = [(absolute_source(source), absolute(target)) for source, target in pairs]
+    engine.check(None, [place for source, _ in whole for place in places_of(source)])
     call = functools.partial(make, settings=settings, overwrite=overwrite, resources=resources)
-    calls = [
-        (source, absolute(target))
-        for source, (_, target), is_small in zip(sources, pairs, small, strict=True)
-        if is_small
-    ]
+    calls = list(itertools.compress(whole, small))
     with engine.map_calls("baking", call, calls, progress, "scene") as outcomes:
         for (_, target), is_small in zip(pairs, small, strict=True):
             outcome = next(outcomes) if is_small else LARGE
@@ -646,7 +626,7 @@ def bake_side_by_side(
 
 
 def _fits_in_memory(source: Source, settings: BakeSettings, memory: int | None) -> bool:
-    """Return whether an input can be baked in this many bytes of memory; trees and unreadable inputs can."""
+    """Return whether an input can be baked in this many bytes of memory; trees and unreadable inputs always can."""
     try:
         with open_reader(source) as header:
             needed = in_memory_bytes(settings, header.count, header.sh_degree)

@@ -1,7 +1,4 @@
-"""Memory and disk space that a bake takes: estimates.
-
-Coefficients are measured as those of `lod.tree_settings.SplatBytes`.
-"""
+"""Estimates of the memory and disk space of a bake, by measured coefficients as in `lod.tree_settings.SplatBytes`."""
 
 from __future__ import annotations
 
@@ -13,14 +10,13 @@ from ..system.errors import OutOfMemoryError
 from ..system.units import format_size, megabytes
 from .settings import BakeSettings
 
-#: Default share of the available memory that a bake may take: other programs need some, and these figures are
-#: estimates. Chosen.
+#: Default share of the available memory that a bake may take. Chosen.
 MEMORY_SHARE = 0.75
 
-#: Factor of the memory that an error asks for, since `format_size` rounds by up to 5 %.
+#: Factor of the memory that an error recommends, since `format_size` rounds by up to 5 %.
 ENOUGH = 1.05
 
-#: Bytes of a process with numba and all kernels, before it has read anything.
+#: Bytes of a process with numba and all kernels, before it reads inputs.
 PROCESS = 200_000_000
 
 #: Bytes per splat of the input while its tree is refined, besides the tree, and bytes of the pictures. Measured with up
@@ -30,7 +26,7 @@ OF_REFINED, PICTURES = (500, 40), 310_000_000
 #: Most and least splats of a block. More are no faster, and fewer make its margins too large a part of it.
 MOST_BLOCK_SPLATS, LEAST_BLOCK_SPLATS = 1 << 21, 1 << 16
 
-#: Out of core, bytes per node of a window, which is read, gathered or encoded at once, and its nodes.
+#: Out of core, bytes per node of a window, which is read, gathered or encoded at once; and nodes of a window.
 OF_WINDOW, WINDOW = (230, 50), 1 << 19
 
 #: Out of core, bytes per splat of the whole scene while its nodes are ordered, other than for streaming.
@@ -54,7 +50,7 @@ def in_memory_bytes(settings: BakeSettings, splats: int, sh_degree: int) -> int:
 
 
 def most_in_memory(memory: int, settings: BakeSettings, sh_degree: int) -> int:
-    """Return the size of the largest scene, splats, that can be baked in memory of this many bytes."""
+    """Return the size of the largest scene, splats, that can be baked in this many bytes of memory."""
     fixed, one = (in_memory_bytes(settings, splats, sh_degree) for splats in (0, 1))
     return max(memory - fixed, 0) // (one - fixed)
 
@@ -63,7 +59,7 @@ def out_of_core_bytes(
     method: str, splats: int, sh_degree: int, block_splats: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int:
     """Return the peak memory of a bake out of core, bytes; `in_chunks` if the output has the order for streaming."""
-    from ..lod.chunk_order import MOST_FAMILIES, family_bytes  # takes long to load, and this is asked out of core only
+    from ..lod.chunk_order import MOST_FAMILIES, family_bytes  # loads slowly, and bakes in memory need neither
 
     window = bytes_of(OF_WINDOW, min(2 * splats, WINDOW), sh_degree)
     block = bytes_of(BUILDERS[method].in_block, min(splats, block_splats), sh_degree)
@@ -74,7 +70,7 @@ def out_of_core_bytes(
 
 
 def windows_within(memory: int | None, splats: int, sh_degree: int, threads: int) -> int:
-    """Return the number of windows of nodes that fit into memory at once, from one to `threads`."""
+    """Return the number of windows of nodes that fit into memory at once, from 1 to `threads`."""
     window = bytes_of(OF_WINDOW, min(2 * splats, WINDOW), sh_degree)
     if memory is None or not window:
         return threads
@@ -89,13 +85,13 @@ def scratch_bytes(method: str, splats: int, sh_degree: int) -> int:
 def block_splats_within(
     memory: int | None, method: str, splats: int, sh_degree: int, *, in_chunks: bool = False, threads: int = 1
 ) -> int:
-    """Return the size of blocks, a power of two, so that nearly the same memory gives the same blocks.
+    """Return the size of blocks, splats: a power of two, so that nearly the same memory gives the same blocks.
 
     Args:
         memory: bytes that a bake may take; None for any number.
 
     Raises:
-        OutOfMemoryError: too little memory for blocks of `LEAST_BLOCK_SPLATS`.
+        OutOfMemoryError: the memory is too little for blocks of `LEAST_BLOCK_SPLATS`.
     """
     size = MOST_BLOCK_SPLATS
     needed = functools.partial(out_of_core_bytes, method, splats, sh_degree, in_chunks=in_chunks, threads=threads)

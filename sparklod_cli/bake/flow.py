@@ -15,15 +15,14 @@ from ..codecs.formats import META, RAD_SUFFIX
 from ..codecs.reader import Reader
 from ..io.reading import Source, open_reader
 from ..lod.tree_settings import METHODS
-from ..model.scene import Scene, up_note
+from ..model.scene import up_note
 from ..system.addresses import Place
 from ..system.errors import memory_errors_translated
 from ..system.progress import Progress, silent
 from ..system.stdio import DASH
 from . import estimate
-from .in_memory import build, put_in_order
+from .built_tree import build, output_of, put_in_order, write_whole, write_windows
 from .settings import Baked, BakeSettings, Resources
-from .tree_output import output_of, write_whole, write_windows
 
 if TYPE_CHECKING:
     from .job import Engine
@@ -49,13 +48,12 @@ def bake(
 ) -> Baked:
     """Read splat files, build a tree of them or keep that of a single input, and write a Level-of-Detail file.
 
-    A scene too large for the memory allowed is baked out of core: block by block, with a scratch folder.
+    A scene too large for memory is baked out of core: block by block, with a scratch folder.
 
     Args:
-        source: - is standard input; several files are one scene.
-        target: of the chosen format, whatever its name; - is standard output.
-        resources: None for those of an otherwise idle machine.
-        engine: runs the tasks of the bake, which then goes out of core; None for this process.
+        target: has the format of the settings, whatever its name; - is standard output.
+        resources: None for the default ones.
+        engine: runs the tasks of a bake, which then goes out of core; None for this process.
         say: receives one-line messages for the user.
 
     Raises:
@@ -107,8 +105,7 @@ def bake(
             if fitting is not None and settings.simplify is None:  # of a simplified scene, its one cut is fitted
                 from .simplifying import refined
 
-                assert isinstance(tree.nodes, Scene)
-                tree.nodes, baked.refine = refined(tree.nodes, fitting, threads=threads, progress=progress, say=say)
+                tree.nodes, baked.refine = refined(tree.scene, fitting, threads=threads, progress=progress, say=say)
                 tree.end("refine")
             put_in_order(tree, threads, progress)
         else:
@@ -125,7 +122,7 @@ def bake(
 
 
 def has_published(source: Source, target: Place, settings: BakeSettings, resources: Resources) -> bool:
-    """Return whether the bake to be resumed was interrupted when all or part of its output may have been in place."""
+    """Return whether an interrupted bake may have put all or part of its output in place."""
     from .job import PUBLISHED
     from .store import Store
 
@@ -133,7 +130,7 @@ def has_published(source: Source, target: Place, settings: BakeSettings, resourc
 
 
 def scratch_folder(source: Source, target: Place, settings: BakeSettings, parent: Place | None) -> Place:
-    """Return the scratch folder of a bake; for standard output, a temporary one that is named after the input.
+    """Return the scratch folder of a bake; for standard output, a temporary folder that is named after the input.
 
     Args:
         parent: folder for the scratch folders of several bakes; None for the folder of the output.
@@ -143,27 +140,27 @@ def scratch_folder(source: Source, target: Place, settings: BakeSettings, parent
 
         parent = parent or Path(tempfile.gettempdir())
         return parent / f"standard-output-{BakeIdentity.of(source, settings).digest[:8]}{SCRATCH}"
-    short = target.name if len(os.fsencode(target.name)) <= NAME_BYTES else f"output-{_digest(target.name)}"
+
+    def digest(text: str) -> str:
+        return hashlib.blake2b(os.fsencode(text), digest_size=4).hexdigest()
+
+    short = target.name if len(os.fsencode(target.name)) <= NAME_BYTES else f"output-{digest(target.name)}"
     if parent is None:
         return target.parent / f"{short}{SCRATCH}"
     whole = os.path.realpath(target) if isinstance(target, Path) else target.url
-    return parent / f"{short}-{_digest(whole)}{SCRATCH}"
-
-
-def _digest(text: str) -> str:
-    return hashlib.blake2b(os.fsencode(text), digest_size=4).hexdigest()
+    return parent / f"{short}-{digest(whole)}{SCRATCH}"
 
 
 def _may_need_blocks(
     header: Reader, source: Source, target: Place, settings: BakeSettings, resources: Resources, engine: Engine | None
 ) -> bool:
-    """Return whether a bake goes out of core, or an interrupted one may have left a scratch folder."""
-    files = settings.rgba or settings.environment or settings.camera_path  # a missing one is reported early
-    if engine is not None or files or not isinstance(target, Path):
+    """Return whether a bake may go out of core, or an interrupted bake may have left a scratch folder."""
+    # `planning` reports a missing file of the settings early.
+    if engine is not None or settings.files or not isinstance(target, Path):
         return True
     if resources != Resources(memory=resources.memory):
         return True
-    # A scene of one small block takes hardly less memory out of core, so that what is available is not asked.
+    # A scene of one small block takes hardly less memory out of core, so the available memory does not matter.
     if resources.memory is not None or header.count > estimate.LEAST_BLOCK_SPLATS:
         memory = estimate.default_memory() if resources.memory is None else resources.memory
         if memory is not None and estimate.in_memory_bytes(settings, header.count, header.sh_degree) > memory:
@@ -173,19 +170,15 @@ def _may_need_blocks(
     return scratch_folder(source, target, settings, None).exists()
 
 
-#: Suffix of a SOG, which has a palette of spherical harmonics.
-_SOG = ".sog"
-
-
 def stage_shares(settings: BakeSettings) -> dict[str, float]:
-    """Return the stages of a bake, as its progress names them, in order, with the relative time of each.
+    """Return the stages of a bake in order, by their names in its progress, with the relative time of each.
 
-    Estimates, from bakes of 500,000 splats on two threads. A stage that an input turns out not to need is passed over.
+    Estimates, from bakes of 500,000 splats on two threads. An input may need fewer stages.
     """
     is_quick = settings.method == METHODS[0]
     is_file = settings.detail is None and settings.tiles is None
     has_chunks = is_file and settings.suffix == RAD_SUFFIX
-    has_palette = is_file and (settings.options.rad.sh_codes is not None or settings.suffix in (_SOG, META))
+    has_palette = is_file and (settings.options.rad.sh_codes is not None or settings.suffix in (".sog", META))
     rows = [
         ("reading", 1.0, True),
         ("building", 2.0 if is_quick else 5.0, True),

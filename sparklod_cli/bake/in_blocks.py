@@ -1,4 +1,4 @@
-"""A bake out of core: splats are sorted into blocks in a store, and stages build their tree."""
+"""Bakes out of core: tasks sort splats into blocks in a store, build the tree in stages, order and encode it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ..model.splats import FloatArray, Splats
 from ..system.errors import InvalidSplatsError
 from ..system.progress import Progress
 from ..system.threads import blocks_of, on_threads
-from .in_memory import check_transformed, select, transform
+from .built_tree import BuiltTree, check_transformed, select, transform
 from .job import (
     ORDER,
     PUBLISHED,
@@ -39,15 +39,14 @@ from .job import (
     pending_of,
     stage_of,
 )
-from .order import WINDOW_NODES, Rows, encode, encoded_array, fill_rows, node_stream, put_order, rows_of, splats_of
+from .order import WINDOW_NODES, Rows, encode, encoded_array, node_stream, put_order, rows_of, splats_of
 from .settings import BakeSettings
 from .store import Arrays
-from .tree_output import BuiltTree
 
 if TYPE_CHECKING:
     from ..codecs.encoder import Encoder, Windows
 
-#: Largest size of a block, as a multiple of the requested one; a scene with a larger block is divided again. Chosen.
+#: Largest size of a block, as a multiple of the requested size; a scene with a larger one is divided again. Chosen.
 SLACK = 1.3
 
 #: How often a scene is divided at most: by samples of the input, then by an even sample of the selected splats.
@@ -56,26 +55,26 @@ ROUNDS = 2
 #: Work of a join for each splat below it, as a share of that of a block: a few per cent of the nodes are left. Chosen.
 JOIN_WORK = 0.1
 
-#: Splats of an input part, unless blocks are smaller, and the most parts: a part makes a file for each group of blocks,
-#: of which there should not be too many. Chosen.
+#: Splats of an input part, unless blocks are smaller, and most parts, as each makes a file for each group of blocks.
+#: Chosen.
 PART_SPLATS, MAX_PARTS = 1 << 19, 256
 
-#: Ranges of the input that are sampled first: for each block, at least, and at most; and splats of each. The sizes of
-#: blocks then differ by a few per cent, even if neighbours in the file are neighbours in space. Chosen.
+#: Sampled ranges of the input: for each block, least and most in all, and splats of each. Sizes of blocks then differ
+#: by a few per cent, even if neighbours in the file are neighbours in space. Chosen.
 RANGES_OF_BLOCK, MIN_RANGES, MAX_RANGES, RANGE_SPLATS = 32, 64, 512, 256
 
-#: Splats of the sample that a builder plans by, or a few more. Chosen.
+#: Approximate size of the sample from which a builder plans, splats. Chosen.
 SAMPLE_SPLATS = 1 << 18
 
 
 @dataclass
 class InBlocks:
-    """Workspace of a bake in a scratch folder, and its steps.
+    """Bake in a scratch folder, whose steps run in the order build, order, encode.
 
     Attributes:
-        job: of all tasks; `build` and `order` fill it in.
+        job: data of the tasks so far.
         block_splats: approximate size of a block.
-        windows: number of windows of nodes that are encoded at once.
+        windows: number of windows of nodes to encode at once.
     """
 
     job: Job
@@ -86,13 +85,13 @@ class InBlocks:
 
     def build(self, tree: BuiltTree) -> None:
         """Scatter the splats of the input to blocks, and build the tree in stages."""
-        stream, settings = self.job.stream, self.job.settings
-        if not stream.count:
+        settings = self.job.settings
+        if not self.job.stream.count:
             settings.selection.check(SelectionTally())
         summary = self._scatter()
         tree.end("read")
-        if (form := tree.form) is not None:  # one that cannot hold the tree is reported now
-            form.codec().settled(summary.statistics, tree.options)
+        assert tree.form is not None
+        tree.form.codec().settled(summary.statistics, tree.options)  # reports a tree that the output cannot hold
         setting = getattr(settings, BUILDERS[settings.method].setting)
         plan = self.job.builder().plan(summary.bounds, splats_of(summary.sample), setting)
         self.job = job = dataclasses.replace(self.job, plan=plan)
@@ -103,16 +102,12 @@ class InBlocks:
         baked.blocks = job.blocks.count
 
     def order(self, tree: BuiltTree) -> None:
-        """Order the nodes; put the plan of each window into the store."""
+        """Order the nodes, and put the plan of each window into the store."""
         job = self.job
         stages = [job.store.get(stage_of(stage.number)) for stage in job.blocks.stages]
         self.job = job = dataclasses.replace(job, families=tuple(int(stage["counts"][0]) for stage in stages))
-        self.engine.run(
-            "arranging" if job.in_chunks else "ordering",
-            [Task(ORDER, put_order, weight=sum(job.families))],
-            job,
-            self.progress,
-        )
+        task = Task(ORDER, put_order, weight=sum(job.families))
+        self.engine.run("arranging" if job.in_chunks else "ordering", [task], job, self.progress)
         tree.end("order")
         tree.baked.nodes, tree.baked.levels = job.store.get(ORDER, ["counts"])["counts"].tolist()
         tree.baked.sh_degree = job.sh_degree
@@ -120,16 +115,10 @@ class InBlocks:
         tree.nodes = node_stream(job, tree.baked.nodes)
 
     def encode(self, tree: BuiltTree, encoder: Encoder) -> Windows:
-        """Encode the windows of the tree; the output may be in place if the bake is interrupted from then on."""
+        """Encode the windows of the tree, and mark in the store that from now on the output may be in place."""
         job = dataclasses.replace(self.job, encoder=encoder)
         tasks = [
-            Task(
-                encoded_of(window),
-                encode,
-                (part.start, part.stop),
-                weight=part.stop - part.start,
-                together=self.windows,
-            )
+            Task(encoded_of(window), encode, (part.start, part.stop), (), part.stop - part.start, self.windows)
             for window, part in enumerate(blocks_of(tree.baked.nodes, WINDOW_NODES))
         ]
         self.engine.run("encoding", tasks, job, self.progress)
@@ -173,10 +162,10 @@ class InBlocks:
 def _read_leaves(
     stream: Reader, start: int, stop: int, settings: BakeSettings
 ) -> Iterator[tuple[Splats, SelectionTally, int]]:
-    """Yield the leaves of a range of the input in pieces.
+    """Read, select and transform a range of the input in pieces.
 
     Yields:
-        selected splats, transformed; the tally of all; and how many selected splats left the range of float32.
+        the selected splats; the tally of all; and how many of the selected left the range of float32.
     """
     for splats in stream.blocks(start, stop):
         selected, tally = select(splats, settings, start=start, total=stream.count)
@@ -186,10 +175,10 @@ def _read_leaves(
 
 
 def _sample_centers(stream: Reader, settings: BakeSettings, blocks: int) -> tuple[FloatArray, float]:
-    """Return (n, 3) centres of selected splats, from ranges all over the input, and the share of selected splats.
+    """Sample ranges all over the input; return (n, 3) centres of selected splats, and their share of the sample.
 
     Args:
-        blocks: approximate number of blocks; for one, nothing is read.
+        blocks: approximate number of blocks; for one, no sample is needed.
     """
     if blocks == 1:
         return np.empty((0, 3), np.float32), 1.0
@@ -207,12 +196,12 @@ def _sample_centers(stream: Reader, settings: BakeSettings, blocks: int) -> tupl
 
 @dataclass(frozen=True, eq=False)
 class InputSummary:
-    """Counts, bounds, sample and statistics of the splats of an input.
+    """Counts of the splats of an input; bounds, sample and statistics of the selected ones.
 
     Attributes:
-        tallies: of selected and dropped splats, by part of the input; the rest is of selected splats.
+        tallies: counts of selected and dropped splats, by part of the input.
         beyond: number of splats that left the range of float32 when they were transformed.
-        sample: at an even stride.
+        sample: rows at an even stride.
     """
 
     tallies: Sequence[SelectionTally]
@@ -223,7 +212,7 @@ class InputSummary:
 
     @classmethod
     def of(cls, parts: Sequence[Arrays]) -> InputSummary:
-        """Return the summary of one or more parts, in their order, from the results of `scatter`."""
+        """Summarize one or more parts in order, from the results of `scatter`."""
         tallies = []
         for _, count, first, *dropped in (part["counts"].tolist() for part in parts):
             reasons = {reason: number for reason, number in zip(REASONS, dropped, strict=True) if number}
@@ -244,18 +233,18 @@ class InputSummary:
 
 
 def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
-    """Sort the splats of an input part into blocks; a task.
+    """Sort the splats of an input part into blocks, as a task.
 
     Results, by group of blocks: `rows`, sorted by block, and `index`, places among the selected splats of this part;
-    then their summary: `first`, the first splat of each block; `counts`, of splats beyond the range of float32, all
-    splats, the first invalid one or -1, and dropped ones by reason; `limits`, (2, 4) float64 least and largest centre
+    then a summary: `first`, the first splat of each block; `counts`: splats beyond the range of float32, all splats,
+    number of the first invalid one or -1, and dropped ones by reason; `limits`, (2, 4) float64 least and largest centre
     and size; `sample`, rows at an even stride; and `statistics`.
     """
     start, stop = job.parts[number : number + 2]
     rows = np.empty((stop - start, width_of(job.sh_degree)), np.float32)
     used, tally, beyond = 0, SelectionTally(), 0
     for leaves, read, outside in _read_leaves(job.stream, start, stop, job.settings):
-        fill_rows(leaves, rows[used : used + len(leaves)], threads)
+        rows_of(leaves, threads, rows[used : used + len(leaves)])
         used += len(leaves)
         tally, beyond = tally.then(read), beyond + outside
         progress("reading", tally.count, stop - start, "splat")
@@ -276,7 +265,7 @@ def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:
 
 
 def _stages(job: Job) -> Iterator[Task]:
-    """Yield the tasks of all stages, and those that remove splats as soon as no stage needs them."""
+    """Yield the tasks of all stages, and tasks that remove splats as soon as no stage needs them."""
     blocks = job.blocks
     ends = {group.stop - 1: number for number, group in enumerate(blocks.groups)}
     share = job.selected[-1] // blocks.count
@@ -291,10 +280,10 @@ def _stages(job: Job) -> Iterator[Task]:
 
 
 def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> None:
-    """Run a stage of the build; a task.
+    """Run a stage of the build, as a task.
 
-    Results: families, whose nodes are `rows`; nodes without a parent, or the root of the last stage; then counts and
-    statistics of the nodes.
+    Results: families, whose nodes are `rows`; the nodes without a parent, or the root from the last stage; then counts
+    and statistics of the nodes.
     """
     stage, builder = job.blocks.stages[number], job.builder()
     with on_threads(threads):
@@ -318,14 +307,14 @@ def build_stage(job: Job, number: int, *, threads: int, progress: Progress) -> N
 
 
 def clean(job: Job, group: int, *, threads: int, progress: Progress) -> None:
-    """Remove the splats of a group of blocks whose stages are done; a task."""
+    """Remove the splats of a group of blocks whose stages are done, as a task."""
     for part in range(len(job.parts) - 1):
         job.store.remove(job.splats(part, group))
     job.store.put(clean_of(group), {})
 
 
 def _read_block(job: Job, block: int, threads: int) -> tuple[Splats, NDArray[np.int64]]:
-    """Return the splats of a block, and the place of each among all selected splats."""
+    """Read the splats of a block, and the place of each among all selected splats."""
     group = next(number for number, blocks in enumerate(job.blocks.groups) if block in blocks)
     begin = job.blocks.groups[group].start
     ranges = []

@@ -1,4 +1,4 @@
-"""Job of a bake out of core: blocks of the scene, tasks with results in a store, and the engine in this process."""
+"""Bakes out of core as jobs: division into blocks, tasks with results in a store, and an engine that runs them."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from .store import Store
 if TYPE_CHECKING:
     from ..codecs.encoder import Encoder
 
-#: The most regions that are joined at once: those of three splits.
-CHILDREN = 8
+#: Levels of splits whose regions are joined at once.
+JOINED_SPLITS = 3
 
-#: Share of the centres at either end of an axis that is left out of its extent: a few splats of a scan lie far away.
+#: Share of the centres at either end of an axis that its extent leaves out, as a few splats of a scan lie far away.
 OUTLIERS = 0.02
 
 
@@ -39,7 +39,7 @@ class BuildStage:
     Attributes:
         number: greater than those of its children.
         region: of the scene; None for the whole scene, the last stage.
-        block: that the stage builds on; None for a join of other stages.
+        block: number of the block of which the stage builds trees; None for a join of other stages.
         children: numbers of the joined stages, in ascending order of their blocks.
         blocks: number of blocks below the stage.
     """
@@ -56,8 +56,8 @@ class BlockDivision:
     """Division of a scene into blocks.
 
     Attributes:
-        splits: (axis, value, low, high) of each split: centres below the value are on the low side. A side is the
-            number of another split, or ~number of a block.
+        splits: (axis, value, low, high): centres below the value are on the low side. A side is the number of another
+            split, or ~number of a block.
         stages: by number, children first.
     """
 
@@ -78,7 +78,7 @@ class BlockDivision:
         return tuple(range(start, stop) for start, stop in zip([0, *ends], ends, strict=False))
 
     def sort(self, center: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return (N,) the splats, sorted stably by their blocks, and (blocks + 1,) the first of each block, and N."""
+        """Sort splats stably by block; return (N,) their order, and (blocks + 1,) the first of each block, and N."""
         parts: list[NDArray[np.int64]] = [np.empty(0, np.int64)] * self.count
         pending = [(0 if self.splits else ~0, np.arange(len(center)))]
         while pending:
@@ -92,17 +92,16 @@ class BlockDivision:
         return np.concatenate(parts), np.cumsum([0, *map(len, parts)])
 
 
-#: A split, see `BlockDivision`, and a part of a scene: its side of a split, and its region.
+#: A split, see `BlockDivision`; and a part of a scene: a side of a split, and its region.
 Split = tuple[int, float, int, int]
 Part = tuple[int, Region]
 
 
 def cut_into_blocks(sample: FloatArray, count: int, block_splats: int) -> BlockDivision:
-    """Divide a scene into blocks of about `block_splats` at most, by a sample of its centres.
+    """Divide a scene of `count` splats into blocks of about `block_splats` at most.
 
     Args:
-        sample: (n, 3) centres, evenly drawn; without any, the scene is one block.
-        block_splats: at least 1.
+        sample: (n, 3) evenly drawn centres; without any, the scene is one block.
     """
     splits, stages = list[Split](), list[BuildStage]()
     whole = _divide(sample, -(-count // block_splats), splits, itertools.count())
@@ -112,7 +111,7 @@ def cut_into_blocks(sample: FloatArray, count: int, block_splats: int) -> BlockD
 
 
 def _divide(center: FloatArray, count: int, splits: list[Split], blocks: Iterator[int]) -> int:
-    """Divide centres into at most `count` blocks; return the side that stands for them in a split."""
+    """Divide centres into at most `count` blocks; return their side, see `BlockDivision.splits`."""
     split = _split(center, count) if count > 1 else None
     if split is None:
         return ~next(blocks)
@@ -127,7 +126,7 @@ def _divide(center: FloatArray, count: int, splits: list[Split], blocks: Iterato
 
 
 def _split(center: FloatArray, count: int) -> tuple[int, float] | None:
-    """Return the axis and the value of a split; None if all centres are the same."""
+    """Return the axis and the value of a split of centres for `count` blocks; None if all centres are equal."""
     if not len(center):
         return None
     low, high = np.quantile(center, [OUTLIERS, 1 - OUTLIERS], axis=0)
@@ -141,12 +140,12 @@ def _split(center: FloatArray, count: int) -> tuple[int, float] | None:
 
 
 def _add_stage(part: Part, splits: Sequence[Split], stages: list[BuildStage]) -> BuildStage:
-    """Add the stage of a part of a scene, after the stages that it joins."""
+    """Append the stage of a part of a scene after the stages that it joins, and return it."""
     side, region = part
     below = []
     if side >= 0:
         parts = [part]
-        for _ in range(int(math.log2(CHILDREN))):
+        for _ in range(JOINED_SPLITS):
             parts = [half for each in parts for half in _halves(each, splits)]
         below = [_add_stage(each, splits, stages) for each in parts]
     stage = BuildStage(
@@ -161,34 +160,28 @@ def _add_stage(part: Part, splits: Sequence[Split], stages: list[BuildStage]) ->
 
 
 def _halves(part: Part, splits: Sequence[Split]) -> list[Part]:
-    """Return the halves of a part; a block is one part."""
+    """Return the two halves of a part, or a part that is a block."""
     side, region = part
     if side < 0:
         return [part]
     axis, value, low, high = splits[side]
-    below = Region(region.low, _moved(region.high, axis, value))
-    return [(low, below), (high, Region(_moved(region.low, axis, value), region.high))]
 
+    def moved(corner: tuple[float, ...]) -> Any:
+        return (*corner[:axis], value, *corner[axis + 1 :])
 
-def _moved(corner: tuple[float, float, float], axis: int, value: float) -> tuple[float, float, float]:
-    x, y, z = (value if each == axis else corner[each] for each in range(3))
-    return x, y, z
-
-
-#: Division of a scene before it is divided.
-NO_BLOCKS = BlockDivision((), ())
+    return [(low, Region(region.low, moved(region.high))), (high, Region(moved(region.low), region.high))]
 
 
 @dataclass(frozen=True)
 class Job:
-    """Data shared by all tasks of a bake; small, so that it can be pickled.
+    """Data shared by all tasks of a bake, small enough to be pickled for each.
 
     Attributes:
-        stream: the input; can be pickled, too.
+        stream: the input.
         needed: statistics that determine how the output is written, see `codecs.statistics`.
         in_chunks: the output has the order for streaming.
         parts: first splat of each part of the input, and the count; empty until the input is divided.
-        blocks: division of the scene; `NO_BLOCKS` until it is divided.
+        blocks: division of the scene.
         round: how often the scene was divided before.
         selected: number of selected splats before each part; empty until the input is read.
         plan: of the builder; None until the input is read.
@@ -202,7 +195,7 @@ class Job:
     needed: frozenset[str]
     in_chunks: bool
     parts: tuple[int, ...] = ()
-    blocks: BlockDivision = NO_BLOCKS
+    blocks: BlockDivision = BlockDivision((), ())
     round: int = 0
     selected: tuple[int, ...] = ()
     plan: Any = None
@@ -211,7 +204,7 @@ class Job:
 
     @property
     def sh_degree(self) -> int:
-        """SH degree of the tree."""
+        """SH degree of the tree: that of the input, limited by the settings."""
         return min(self.stream.sh_degree, self.settings.max_sh)
 
     def builder(self) -> StagedBuilder:
@@ -220,7 +213,7 @@ class Job:
         return builder
 
     def part(self, number: int) -> str:
-        """Return the name of the result that marks an input part as scattered to blocks, with its statistics."""
+        """Return the name of the result that summarizes an input part and marks it as scattered to blocks."""
         return f"scatter-{self.round}/{number}"
 
     def splats(self, part: int, group: int) -> str:
@@ -228,18 +221,17 @@ class Job:
         return f"{self.part(part)}/{group}"
 
 
-#: Names of results by number: the counts of a stage, which mark the stage as done; its families; the nodes that it
-#: hands on; the plan of a window of nodes; the encoded window; and the mark that the splats of a group of blocks were
-#: removed.
+#: Names of results by number: counts of a stage, which mark it as done; its families; its nodes without a parent; plan
+#: of a window of nodes; encoded window; and the mark that the splats of a group of blocks were removed.
 stage_of, families_of, pending_of = "stage/{}".format, "families/{}".format, "pending/{}".format
 window_of, encoded_of, clean_of = "order/{}".format, "encoded/{}".format, "clean/{}".format
 
-#: Names of results: the root; the counts of the ordered tree; and the mark that the output may be in place.
+#: Names of results: root; counts of the ordered tree; and the mark that the output may be in place.
 ROOT, ORDER, PUBLISHED = "root", "order", "published"
 
 
 def forget(store: Store, damaged: Collection[str]) -> None:
-    """Remove damaged results and those made from them; complete stages are kept."""
+    """Remove damaged results and the results made from them, except those of complete stages."""
     names = set(damaged)
     if any(name.startswith("order") for name in damaged):
         names |= {ORDER}
@@ -256,14 +248,14 @@ def forget(store: Store, damaged: Collection[str]) -> None:
 
 @dataclass(frozen=True)
 class Task:
-    """Piece of work that may be repeated, with the same result.
+    """Piece of work that always gives the same result, so that it may be repeated.
 
     Attributes:
         name: of the task and of its result in the store, which marks the task as done.
         run: function of a module, called as `run(job, *arguments, threads=, progress=)`; it puts the result.
         needs: names of tasks that must be done before.
         weight: amount of work, splats.
-        together: number of such tasks that one process has memory for at once, if they do not need each other.
+        together: number of such tasks, independent of each other, that one process has memory for at once.
     """
 
     name: str
@@ -283,7 +275,7 @@ class Engine(Protocol):
         Args:
             stage: word for the progress ("building").
             tasks: in an order in which they could run one after the other.
-            job: first argument of all of them; can be pickled, and has a `store`.
+            job: first argument of each task; it can be pickled, and has a `store`.
 
         Raises:
             SparklodError: a task failed, repeatedly if repeating could help; the message says what to do.
@@ -292,12 +284,12 @@ class Engine(Protocol):
 
 @dataclass(frozen=True)
 class LocalEngine:
-    """Engine on threads of this process; after an interrupt, the results of finished tasks are in the store."""
+    """Engine on threads of this process; an interrupt leaves the results of finished tasks in the store."""
 
     threads: int = 1
 
     def run(self, stage: str, tasks: Sequence[Task], job: Any, progress: Progress) -> None:
-        """Run tasks as `Engine.run`; an error of a task is raised unchanged."""
+        """Run tasks as `Engine.run`, but raise errors of tasks unchanged."""
         total, done = sum(task.weight for task in tasks), 0
         together = min([self.threads, *(task.together for task in tasks)])
 
@@ -305,7 +297,7 @@ class LocalEngine:
             if not job.store.has(task.name):
                 within = _share_of(progress, stage, done, task.weight, total) if together == 1 else silent
                 task.run(job, *task.arguments, threads=self.threads // together, progress=within)
-                machine.release_memory()  # for the next task, which may need most of it
+                machine.release_memory()  # the next task may need most of it
             return task.weight
 
         for weight in ordered_map(run, tasks, together):
@@ -314,7 +306,7 @@ class LocalEngine:
 
 
 def _share_of(progress: Progress, name: str, before: int, weight: int, total_weight: int) -> Progress:
-    """Return a progress for one task that reports it as part of all tasks and never goes back."""
+    """Return a progress for one task that reports it as part of all tasks, and never goes back."""
     reached = 0
 
     def within(stage: str, done: int, total: int, unit: str) -> None:

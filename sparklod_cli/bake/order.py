@@ -1,9 +1,8 @@
-"""Order of the nodes of a tree out of core, and the windows of nodes that are gathered from the stages' results."""
+"""Order of the nodes of a tree out of core, and windows of nodes gathered from the results of the stages."""
 
 from __future__ import annotations
 
 import bisect
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -28,11 +27,8 @@ from .store import Store
 #: Nodes of a window, whole chunks: 30 MB without SH, 120 MB with SH of degree 3. Chosen.
 WINDOW_NODES = 8 * CHUNK_NODES
 
-#: Families whose keys are in memory at once: some 100 MB. Chosen.
-MERGED = 1 << 22
-
-#: Sampled keys for each `MERGED` families, by which ranges of families are balanced. Chosen.
-PROBES = 256
+#: Families whose keys are in memory at once, some 100 MB, and sampled keys that balance as many families. Chosen.
+MERGED, PROBES = 1 << 22, 256
 
 #: Range of the families of a stage: stage, first family, end.
 Run = tuple[int, int, int]
@@ -40,7 +36,7 @@ Run = tuple[int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class _Links:
-    """Links between F families, numbered stage by stage.
+    """Links between F families (the children of a node), numbered stage by stage.
 
     Attributes:
         begin: (stages + 1,) first family of each stage, and F.
@@ -48,7 +44,7 @@ class _Links:
         row: (F,) place of the first child among the nodes of its stage.
         parent: (F,) family of the parent node; -1 for the children of the root.
         offset: (F,) place of the parent node in its family.
-        runs: of each stage, by batch.
+        runs: for each stage, its run of each batch.
     """
 
     begin: NDArray[np.int64]
@@ -64,14 +60,14 @@ class _Links:
         return 1 + int(self.count.sum(dtype=np.int64))
 
     def starts(self, sequence: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        """Return (F,) the place of the first child of each family, if families are in this sequence."""
+        """Return (F,) the place of the first child of each family, for families in this sequence."""
         start = np.empty(len(sequence), np.uint32)
         ordered = self.count[sequence].astype(np.uint32)
         start[sequence] = np.cumsum(ordered, dtype=np.uint32) - ordered + np.uint32(1)
         return start
 
     def families_at(self, start: NDArray[np.uint32]) -> NDArray[np.int32]:
-        """Return (nodes,) the family of the children of each node, for the places of `starts`; -1 for a leaf."""
+        """Return (nodes,) the family of the children of each node, -1 for a leaf; `start` is from `starts`."""
         at = np.full(self.nodes, -1, np.int32)
         place = start[self.parent]
         place += self.offset
@@ -81,7 +77,7 @@ class _Links:
 
 
 def put_order(job: Job, *, threads: int, progress: Progress) -> None:
-    """Order the nodes; a task. Results: the plan of each window; then the number of nodes and of levels."""
+    """Order the nodes, as a task; put the plan of each window, then the number of nodes and of levels."""
     links = _links(job)
     levels = 1
     sequence, done = np.empty(len(links.count), np.uint32), 0  # the families sorted by batch, then by key
@@ -132,10 +128,10 @@ def _links(job: Job) -> _Links:
 def _arranged(
     job: Job, links: _Links, by_place: NDArray[np.int32], progress: Progress
 ) -> tuple[int, NDArray[np.uint32] | None]:
-    """Return the number of levels, and the sequence of families in the output; None for the builder's.
+    """Return the number of levels, and the sequence of families in the output; None for that of the builder.
 
     Args:
-        by_place: (F,) the families in the order of their parent nodes.
+        by_place: (F,) families in the order of their parent nodes.
     """
     place = np.empty(len(by_place), np.int32)
     place[by_place] = np.arange(len(by_place), dtype=np.int32)
@@ -158,7 +154,7 @@ def _arranged(
 
 
 def _of_all(job: Job, key: str, place: NDArray[np.int32]) -> FloatArray:
-    """Read a column of the families of all stages, each family at its place."""
+    """Read a column of the families of all stages, and put each family at its place."""
     column, begin = np.empty((len(place), *job.store.shape(families_of(0), key)[1:]), np.float32), 0
     for stage, length in enumerate(job.families):
         column[place[begin : begin + length]] = job.store.get(families_of(stage), [key])[key]
@@ -175,11 +171,11 @@ def _put_window(
     start: NDArray[np.uint32],
     at: NDArray[np.int32],
 ) -> None:
-    """Put the plan of a window.
+    """Put the plan of a window of nodes.
 
-    Families overlapping the window, grouped by stage: `stages`, the first one of each stage; for each family, `row`,
-    the place of its children among the nodes of their stage, `count`, how many are in the window, and `target`, their
-    place there. Nodes with children: `owner`, places in the window; `child_start`; `child_count`.
+    For families overlapping the window, grouped by stage: `stages`, the first family of each stage; `row`, the place of
+    the family's first child in the window among the nodes of its stage; `count`, of children in the window; `target`,
+    their place there. For nodes with children: `owner`, the place in the window; `child_start`; `child_count`.
     """
     begin, end = (
         bisect.bisect_right(sequence, place, key=lambda number: int(start[number]))
@@ -208,7 +204,7 @@ def _put_window(
 
 
 def _merged(store: Store, batches: list[dict[int, Run]], begin: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    """Yield the numbers of all families by batch and key, in pieces that fit into memory."""
+    """Yield the numbers of all families, sorted by batch and key, in pieces that fit into memory."""
     for batch in sorted({batch for runs in batches for batch in runs}):
         runs = [runs[batch] for runs in batches if batch in runs]
         words = max(store.shape(families_of(stage), "key")[1] for stage, _, _ in runs)
@@ -219,13 +215,13 @@ def _merged(store: Store, batches: list[dict[int, Run]], begin: NDArray[np.int64
 
 
 def _ranges(store: Store, runs: list[Run], words: int) -> Iterator[list[Run]]:
-    """Yield runs cut at common keys, each range small enough to be sorted at once."""
+    """Cut runs at common keys, and yield the parts of each range of keys; a range can be sorted at once."""
     pieces = -(-sum(stop - start for _, start, stop in runs) // MERGED)
     if pieces == 1:
         yield runs
         return
     ends = np.concatenate([_keys(store, (stage, k, k + 1), words) for stage, a, b in runs for k in (a, b - 1)])
-    # Cut by the first word that differs: families with the same word stay together.
+    # Cut by the first word that differs, as families with the same word must stay together.
     word = int(np.argmax((ends != ends[0]).any(axis=0)))
     columns = [_keys(store, run, words)[:, word].copy() for run in runs]
     probes = np.sort(np.concatenate([column[:: max(1, MERGED // PROBES)] for column in columns]))
@@ -262,7 +258,7 @@ def node_stream(job: Job, count: int) -> Reader:
 
 
 def encode(job: Job, start: int, stop: int, *, threads: int, progress: Progress) -> None:
-    """Encode the nodes of a window; a task. Result: the encoded arrays of its chunks, as NUMBER.NAME."""
+    """Encode the nodes of a window, as a task; put the arrays of its chunks as NUMBER.NAME."""
     assert job.encoder is not None
     encoder = job.encoder
     splats, tree = _read(job.store, width_of(job.sh_degree), start, stop, threads)
@@ -321,43 +317,30 @@ def _read_window(store: Store, width: int, window: int) -> tuple[Rows, LodTree]:
 Rows = NDArray[np.float32]
 
 
-def rows_of(splats: Splats, threads: int = 1) -> Rows:
-    """Pack splats into new rows."""
-    rows = np.empty((len(splats), width_of(splats.sh_degree)), np.float32)
-    fill_rows(splats, rows, threads)
+def rows_of(splats: Splats, threads: int = 1, rows: Rows | None = None) -> Rows:
+    """Pack splats into rows; None for new ones."""
+    if rows is None:
+        rows = np.empty((len(splats), width_of(splats.sh_degree)), np.float32)
+    _copy(splats, rows, threads, to_rows=True)
     return rows
-
-
-def fill_rows(splats: Splats, rows: Rows, threads: int = 1) -> None:
-    """Pack splats into rows."""
-    places = _places(splats)
-
-    def fill(block: slice) -> None:
-        for part, column in places:
-            rows[block, part] = column[block]
-
-    for_blocks(fill, len(rows), threads)
 
 
 def splats_of(rows: Rows, threads: int = 1) -> Splats:
     """Unpack rows."""
     splats = Splats.empty(len(rows), degree_of((rows.shape[1] - width_of(0)) // 3))
-    places = _places(splats)
-
-    def fill(block: slice) -> None:
-        for part, column in places:
-            column[block] = rows[block, part]
-
-    for_blocks(fill, len(rows), threads)
+    _copy(splats, rows, threads, to_rows=False)
     return splats
 
 
-def _places(splats: Splats) -> list[tuple[slice, Rows]]:
-    """Return each column as a matrix, a view of it, and its place in a row."""
-    places, at = [], 0
-    for name in COLUMNS:
-        column = getattr(splats, name)
-        numbers = math.prod(column.shape[1:])
-        places.append((slice(at, at + numbers), column.reshape(len(splats), numbers)))
-        at += numbers
-    return places
+def _copy(splats: Splats, rows: Rows, threads: int, *, to_rows: bool) -> None:
+    columns = [getattr(splats, name).reshape(len(splats), -1) for name in COLUMNS if getattr(splats, name).size]
+    parts = np.split(rows, np.cumsum([column.shape[1] for column in columns])[:-1], axis=1)  # views
+
+    def copy(block: slice) -> None:
+        for column, part in zip(columns, parts, strict=False):  # without rows, there are no columns
+            if to_rows:
+                part[block] = column[block]
+            else:
+                column[block] = part[block]
+
+    for_blocks(copy, len(rows), threads)

@@ -26,12 +26,12 @@ from ..system.threads import ordered_map
 from ..system.units import count_of, format_size, megabytes
 from ..system.untrusted import parse_json
 from . import estimate
+from .built_tree import BuiltTree
 from .identity import BakeIdentity
 from .in_blocks import InBlocks
 from .job import Engine, Job, LocalEngine, forget
 from .settings import BakeSettings, Resources
 from .store import Store
-from .tree_output import BuiltTree
 
 #: Folder in the scratch folder for the unpacked input.
 UNPACKED = "input"

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
     from .parts_output import WrittenDetail, WrittenTiles
     from .simplifying import SimplifyGoal, WrittenSet
 
-#: Suffix of the format that is written unless another one is chosen.
-SPZ = ".spz"
-
-#: Result for a scene that is too large for a worker of a cluster.
+#: Result for a scene that exceeds the memory of a worker of a cluster.
 LARGE: Any = object()
 
 
@@ -34,25 +31,25 @@ class BakeSettings:
     """Settings of a bake.
 
     Attributes:
-        base: of quick, growth of the voxel grid from level to level, 1.1 to 2.0.
-        growth: of quality, the largest number of nodes for each leaf, 1.05 to 2.0.
-        max_sh: the highest SH degree that is kept.
-        selection: its coordinates are those of the input.
+        base: with quick, growth of the voxel grid from level to level, 1.1 to 2.0.
+        growth: with quality, largest number of nodes for each leaf, 1.05 to 2.0.
+        max_sh: highest SH degree to keep.
+        selection: in the coordinates of the input.
         transform: of the selected splats; None for the identity.
         up: axis of the input that points up, one of `scene.AXES`; None for that of the file.
-        rgba: a file of colours and opacities that replace the splats' own, see `io.read_rgba`.
-        suffix: of the format, one of `WRITABLE` that holds trees.
-        detail, tiles: to write a Streamed SOG, or 3D Tiles, instead.
-        environment: of a Streamed SOG, a file whose splats are always drawn; turned and moved as the scene.
+        rgba: file of colours and opacities that replace those of the splats, see `files.read_rgba`.
+        suffix: of the format, one of `WRITABLE`.
+        detail, tiles: write a Streamed SOG, or 3D Tiles, instead.
+        environment: of a Streamed SOG, file of splats that are always drawn; transformed as the scene.
         environment_beyond: of a Streamed SOG, distance beyond which splats become its environment, in the input's
-            units, see `lod.parts.beyond`; None for none.
-        simplify: to write the splats of a cut, without a tree, instead.
-        refine: fitting of merged splats to pictures of full detail, without its cameras; None for none.
-        camera_path: a file of training cameras, or of those by which a PSNR is measured, in the coordinates of the
-            output; None for cameras that are placed around and inside the scene.
-        converts: an input that has a tree keeps it, if its format is another one; otherwise it is refused.
-        recodes: an input that has a tree keeps it in its own format, too, with other options.
-        unused: flags of given options that have no effect on a tree; such an input is refused.
+            units, see `lod.parts.beyond`.
+        simplify: write the splats of a cut, without a tree, instead.
+        refine: fitting of merged splats to pictures of full detail, without its cameras.
+        camera_path: file of the cameras for fitting, or for measuring a PSNR, in the coordinates of the output; None
+            for cameras around and inside the scene.
+        converts: keep the tree of an input for another format or container, rather than refuse it.
+        recodes: keep the tree of an input also for the same format, with other options.
+        unused: flags of options that have no effect on a tree; an input with a tree is refused if there are any.
     """
 
     method: str = METHODS[0]
@@ -63,7 +60,7 @@ class BakeSettings:
     transform: Transform | None = None
     up: str | None = None
     rgba: Path | None = None
-    suffix: str = SPZ
+    suffix: str = ".spz"
     options: WriteOptions = field(default_factory=WriteOptions)
     detail: DetailSettings | None = None
     tiles: TileSettings | None = None
@@ -78,7 +75,7 @@ class BakeSettings:
 
     @property
     def files(self) -> dict[str, Any]:
-        """Files whose contents are inputs of the bake, by the setting that names them."""
+        """Files that are inputs of the bake, by the settings that name them."""
         named = {"rgba": self.rgba, "environment": self.environment, "camera_path": self.camera_path}
         return {name: path for name, path in named.items() if path is not None}
 
@@ -88,10 +85,10 @@ class Resources:
     """Resources that a bake may use.
 
     Attributes:
-        memory: bytes; None for `estimate.MEMORY_SHARE` of what is available.
-        scratch_dir: folder for the scratch folder of a bake out of core; None for that of the output.
-        resume: continue an interrupted bake with its results there.
-        block_splats: splats of a block, out of core; None for as many as the memory allows, at most
+        memory: bytes; None for `estimate.MEMORY_SHARE` of the available memory.
+        scratch_dir: folder for the scratch folder of a bake out of core; None for the folder of the output.
+        resume: continue an interrupted bake from its scratch folder.
+        block_splats: size of a block, out of core; None for as many splats as the memory allows, at most
             `estimate.MOST_BLOCK_SPLATS`.
     """
 
@@ -103,23 +100,20 @@ class Resources:
 
 @dataclass(kw_only=True)
 class Baked:
-    """Result of a bake, which its steps fill in.
-
-    What other outputs, inputs or steps would have is None or empty.
+    """Result of a bake, which its steps fill in; fields that do not apply are None or empty.
 
     Attributes:
         output_format: "spz", "rad", "rad-chunked", "streamed-sog", "3d-tiles", or the name of the format
             of a simplified scene.
         bytes: size of all files of the output.
-        version, fractional_bits: of an SPZ output.
-        chunks, encodings, sh_codes: of a RAD output; its encodings by the field of `RadOptions`, and the most entries
-            of its SH palette.
+        version, fractional_bits: of SPZ.
+        chunks, encodings, sh_codes: of RAD: encodings by field of `RadOptions`, and largest size of the SH palette.
         clamped: number of nodes with a value that the output cannot hold, by column of `Splats`.
-        clamps: at which ends of the range, and how far beyond.
+        clamps: the ends of the ranges that were exceeded, and how far.
         format, notes: of the input, for display.
-        read: number of splats of the input, or of its nodes if it has a tree.
+        read: number of splats, or of nodes, of the input.
         splats: number of leaves.
-        sh_degree, nodes, levels: of the tree; levels are its depth plus 1.
+        levels: depth of the tree plus 1.
         dropped: number of dropped splats by reason (`selection.REASONS`).
         method: builder of the tree; None for the tree of the input.
         seconds: by stage (read, build, order, refine, arrange, levels, tiles, errors, simplify, encode, write).

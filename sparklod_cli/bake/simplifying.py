@@ -1,4 +1,4 @@
-"""Scenes made of a tree, its leaves or a simplified cut, and fitting of trees and cuts to pictures: `--refine`."""
+"""Scenes made from a tree, which are its leaves or a simplified cut, and fitting of trees and cuts: `--refine`."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ if TYPE_CHECKING:
     from ..cameras.camera import Camera
     from ..lod.budget import Budget
 
-#: Number of cameras for a PSNR unless cameras are given, and their seed; a fitted tree is judged by as many.
+#: Number and seed of the cameras by which a PSNR is measured if the user names none.
 CAMERAS, SEED = 16, 0
 
-#: How far a file may be below the size that was asked for, and how far the splats that hold a PSNR may be above the
-#: fewest, as shares: each further halving costs one more encoding, or pictures of all cameras. Chosen.
+#: Tolerances as shares: of a file below --max-bytes, and of splats above the fewest that have a PSNR. Each further
+#: halving costs one more encoding, or pictures of all cameras. Chosen.
 CLOSE_BYTES, CLOSE_COUNT = 0.002, 0.01
 
-#: Encodings at most. Files grow nearly in proportion to their splats, so 3 to 6 do. Chosen.
+#: Most encodings. Files grow nearly in proportion to their splats, so 3 to 6 suffice. Chosen.
 MOST_TRIALS = 16
 
 
 @dataclass(frozen=True)
 class SimplifyGoal:
-    """Size or fidelity of a simplified scene, one of the three; raises `ValueError` if it is out of its range.
+    """Goal of a simplified scene, exactly one of three; raises `ValueError` if it is out of its range.
 
     Attributes:
         to: number of splats, or a share of all.
-        max_bytes: size of a file that as many splats as possible shall fill.
-        psnr: least PSNR against full detail, dB, of as few splats as possible.
+        max_bytes: largest size of the file, which as many splats as possible fill.
+        psnr: least PSNR against full detail, dB, which as few splats as possible reach.
     """
 
     to: Budget | None = None
@@ -71,23 +71,11 @@ class SimplifyGoal:
 Measure = Callable[[int], float]
 
 
-def count_for(
-    goal: SimplifyGoal, leaves: int, *, bytes_of: Measure, psnr_of: Measure, progress: Progress
-) -> tuple[int, float | None]:
-    """Return the number of splats, at most `leaves`, that meets a goal, and their PSNR if the goal is a PSNR.
+def largest_for_bytes(most: int, leaves: int, bytes_of: Measure, progress: Progress) -> int:
+    """Return the largest number of splats, up to `leaves`, whose file has at most `most` bytes, within `CLOSE_BYTES`.
 
     Raise `FormatError` if not even one splat fits.
     """
-    if goal.to is not None:
-        return min(leaves, goal.to.of(leaves)), None
-    if goal.max_bytes is not None:
-        return _largest(goal.max_bytes, leaves, bytes_of, progress), None
-    assert goal.psnr is not None
-    return _smallest(goal.psnr, leaves, psnr_of, progress)
-
-
-def _largest(most: int, leaves: int, bytes_of: Measure, progress: Progress) -> int:
-    """Return the largest number of splats whose file has at most `most` bytes, within `CLOSE_BYTES`."""
     low, high, below, above = 1, leaves, bytes_of(1), bytes_of(leaves)
     if above <= most:
         return leaves
@@ -97,7 +85,7 @@ def _largest(most: int, leaves: int, bytes_of: Measure, progress: Progress) -> i
         progress("simplifying", trial, MOST_TRIALS, "file")
         if high - low <= 1 or most - below <= CLOSE_BYTES * most:
             break
-        # Files are nearly as long as a line says; where that stays at one end, halving gets on.
+        # Sizes are nearly linear, so interpolate; halving advances where that stays at one end.
         guess = low + (high - low) * (most - below) / (above - below) if trial % 4 < 3 else (low + high) / 2
         count = min(max(math.floor(guess), low + 1), high - 1)
         size = bytes_of(count)
@@ -108,8 +96,8 @@ def _largest(most: int, leaves: int, bytes_of: Measure, progress: Progress) -> i
     return low
 
 
-def _smallest(least: float, leaves: int, psnr_of: Measure, progress: Progress) -> tuple[int, float]:
-    """Return the smallest number of splats whose PSNR is at least `least`, within `CLOSE_COUNT`, and the PSNR."""
+def fewest_for_psnr(least: float, leaves: int, psnr_of: Measure, progress: Progress) -> tuple[int, float]:
+    """Return the least number of splats whose PSNR is at least `least` dB, within `CLOSE_COUNT`, and their PSNR."""
     low, high, best = 0, leaves, psnr_of(leaves)
     trials = math.ceil(math.log2(max(math.log(max(leaves, 2)) / math.log1p(CLOSE_COUNT), 1)))
     for trial in range(trials):
@@ -126,11 +114,11 @@ def _smallest(least: float, leaves: int, psnr_of: Measure, progress: Progress) -
 
 
 class Fidelity:
-    """PSNR of cuts of a tree against its leaves, by pictures.
+    """PSNR of cuts of a tree against its leaves, measured on pictures.
 
     Args:
         tree: with opacities of at most 1.
-        cameras: that see it; None for `CAMERAS` around and inside the scene.
+        cameras: None for `CAMERAS` around and inside the scene.
 
     Raises:
         SparklodError: no camera sees anything.
@@ -149,13 +137,13 @@ class Fidelity:
             raise SparklodError("no camera sees enough to measure a PSNR by; name cameras with --camera-path")
 
     def psnr(self, cut: NDArray[np.int64]) -> float:
-        """Return the mean PSNR of a cut, ascending, over all cameras and a black and a white background, dB."""
+        """Return the mean PSNR of a cut, node numbers ascending, over all cameras and black and white, dB."""
         from ..fitting.pictures import mean_psnr
 
         return mean_psnr(self._nodes, lambda camera: cut, self._pictures)
 
     def fitted(self, cut: NDArray[np.int64], nodes: Splats) -> float:
-        """Return the mean PSNR of a cut of the tree with other nodes, dB; later ones are measured with them, too."""
+        """Replace the nodes of the tree, also for later cuts, and return the mean PSNR of a cut, dB."""
         from ..fitting.pictures import columns_of
 
         self._nodes.restore(cut, columns_of(nodes))
@@ -176,15 +164,15 @@ def simplified(
     """Find the cut of a tree that meets a goal, and fit it if requested.
 
     Args:
-        refine: how the cut is fitted to pictures of full detail, for all cameras; None for not at all.
+        refine: settings of fitting the cut to pictures of full detail; None for no fitting.
         cameras: for a PSNR; None for cameras around and inside the scene.
-        bytes_of: size of the file of a scene.
+        bytes_of: returns the size of the file of a scene.
 
     Returns:
-        the cut as a scene without a tree, `WrittenSet.faint`, and its PSNR and the result of fitting it, if requested.
+        the cut as a scene without a tree; `WrittenSet.faint`; and its PSNR and the result of fitting, if requested.
 
     Raises:
-        FormatError, SparklodError: see `count_for` and `Fidelity`; or nothing could be seen of the cut.
+        FormatError, SparklodError: see `largest_for_bytes` and `Fidelity`; or viewers would draw nothing of the cut.
         KeyboardInterrupt: see `refined`.
     """
     from ..lod.parts import RefinementOrder, with_plain_opacity
@@ -197,14 +185,17 @@ def simplified(
     def cut(count: int) -> Scene:
         return dataclasses.replace(tree, splats=tree.splats.take(order.cut(count)), tree=None)
 
-    fidelity = None if goal.psnr is None else Fidelity(tree, cameras, threads)
-    count, measured = count_for(
-        goal,
-        order.leaves,
-        bytes_of=lambda count: bytes_of(cut(count)),
-        psnr_of=lambda count: 0.0 if fidelity is None else fidelity.psnr(order.cut(count)),
-        progress=progress,
-    )
+    fidelity, measured = None, None
+    if goal.to is not None:
+        count = min(order.leaves, goal.to.of(order.leaves))
+    elif goal.max_bytes is not None:
+        count = largest_for_bytes(goal.max_bytes, order.leaves, lambda count: bytes_of(cut(count)), progress)
+    else:
+        assert goal.psnr is not None
+        measurer = fidelity = Fidelity(tree, cameras, threads)
+        count, measured = fewest_for_psnr(
+            goal.psnr, order.leaves, lambda count: measurer.psnr(order.cut(count)), progress
+        )
     fixed, is_seen = order.cut(count), tree.splats.opacity >= MIN_ALPHA
     faint = int(np.count_nonzero(~is_seen[fixed] & ~is_leaf[fixed]))
     if faint and not is_seen[fixed].any() and is_seen[is_leaf].any():
@@ -227,18 +218,18 @@ def write_simplified(
     out: Output,
     form: Format,
     options: WriteOptions,
-    leaves: int,
     end: Callable[[str], None],
-    *,
     threads: int,
     progress: Progress,
+    *,
+    leaves: int,
     **how: Any,
 ) -> tuple[int, WrittenSet]:
-    """Cut a tree and write the cut, a scene without a tree; return the bytes of its files, and their record.
+    """Cut a tree and write the cut as a scene without a tree; return the bytes of its files, and a record.
 
     Args:
+        end: called with the name of each stage but the last, when it is done.
         leaves: number of splats at full detail.
-        end: called with the name of each stage before the last one, when it is done.
         how: further arguments of `simplified`.
     """
 
@@ -259,14 +250,14 @@ def write_simplified(
 
 @dataclass(frozen=True)
 class WrittenSet(Losses):
-    """A simplified scene.
+    """Record of a simplified scene.
 
     Attributes:
-        splats, share: how many, and their share of full detail.
-        faint: number of merged splats that no viewer draws: they stand for splats far apart, and what these cover
-            leaves hardly any opacity to one as large as all of them and the gaps between.
-        psnr: mean over the cameras and a black and a white background, dB; None where it was not measured.
-        refine: result of fitting it; None without `--refine`.
+        share: of the splats of full detail.
+        faint: number of merged splats too faint for any viewer to draw: merged from splats far apart, they also cover
+            the gaps between, and so have hardly any opacity.
+        psnr: mean over the cameras and a black and a white background, dB; None if not measured.
+        refine: result of fitting; None without `--refine`.
     """
 
     splats: int
@@ -293,7 +284,7 @@ def refined(
         fixed: see `fitting.fit.fit`.
 
     Raises:
-        KeyboardInterrupt: the fitting was interrupted before it improved anything.
+        KeyboardInterrupt: Ctrl-C came before the fitting improved anything.
     """
     from ..fitting.fit import fit
 
@@ -316,7 +307,7 @@ def refined(
             say("Stopped before --refine improved anything; no file written.")
             raise KeyboardInterrupt
         say("Interrupted: writing the improvements of the finished stages; another Ctrl-C ends without an output.")
-    # Centres stay in their former box: with another one, a format may need another number of bits, and leaves move.
+    # Centres stay in their former box: in a larger one, a format may have fewer bits for coordinates, and leaves move.
     before = scene.splats.center
     nodes = dataclasses.replace(nodes, center=nodes.center.clip(before.min(axis=0), before.max(axis=0)))
     report = dataclasses.replace(report, seconds=round(time.perf_counter() - start, 4))
@@ -324,7 +315,7 @@ def refined(
 
 
 def leaves_of(scene: Scene) -> Scene:
-    """Return the splats that a tree was built of, as a scene without a tree; raise `FormatError` without a tree."""
+    """Return the splats that a tree was built from, as a scene without a tree; raise `FormatError` without a tree."""
     if scene.tree is None:
         raise FormatError("it has no Level-of-Detail tree whose leaves could be written")
     leaves = scene.splats.take(scene.tree.is_leaf)

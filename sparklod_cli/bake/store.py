@@ -1,7 +1,7 @@
 """Store of results: .npy files in a folder, which several machines may mount, or at an address.
 
-A file is one record, whose fields are the arrays of a result: `numpy.load` reads it. Before them, CRC32 has a checksum
-of each array, which covers the header, too.
+A file is one record, which `numpy.load` reads: its fields are the arrays of a result, after a field CRC32 with a
+checksum of each, which covers the header, too.
 """
 
 from __future__ import annotations
@@ -31,17 +31,14 @@ from ..system.output import write_atomically
 #: Arrays of a result by name, empty or of any shape.
 Arrays = Mapping[str, NDArray[Any]]
 
-#: Suffix of result files, so that a result may have the name of a folder of others.
+#: Suffix of result files: without it, no result could have the name of a folder of others.
 SUFFIX = ".npy"
 
-#: Field with the checksums of the others.
+#: Field with the checksums of the other fields.
 CRC32 = "crc32"
 
-#: Bytes read at once of the beginning of a file: the header and the checksums, some 40 an array.
-READ_AHEAD = 1 << 16
-
-#: Bytes read at once of a result that is only checked.
-CHECK_BYTES = 1 << 24
+#: Bytes read for the header and the checksums, some 40 an array; and bytes of a piece of a result that is only checked.
+READ_AHEAD, CHECK_BYTES = 1 << 16, 1 << 24
 
 #: Most rows between requested rows that are read with them rather than skipped. Chosen: some 10 KB.
 GAP = 128
@@ -53,7 +50,11 @@ _File = FileIO | BufferedReader
 
 
 class DamagedError(ValueError):
-    """A result file is damaged; the message says what is wrong."""
+    """A result file is damaged."""
+
+
+#: Errors of a result that is missing or damaged.
+MISSING = (FileNotFoundError, NotADirectoryError, DamagedError)
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class StoredArray:
     """Array of a result file.
 
     Attributes:
-        offset: bytes of the file before its numbers.
+        offset: of the numbers in the file, bytes.
         begun: CRC-32 of the file's header.
         checksum: CRC-32 of the header and the numbers.
     """
@@ -73,7 +74,7 @@ class StoredArray:
     checksum: int
 
     def check(self, pieces: Iterable[NDArray[Any]]) -> int:
-        """Return the size of the numbers in bytes; raise `DamagedError` if they do not match the checksum."""
+        """Compare the numbers with the checksum, else raise `DamagedError`; return their size in bytes."""
         checksum, size = self.begun, 0
         for piece in pieces:
             checksum, size = zlib.crc32(_bytes(piece), checksum), size + piece.nbytes
@@ -94,10 +95,7 @@ def encode(arrays: Arrays) -> Iterator[bytes | memoryview]:
 
 
 def read_directory(file: _File, size: int) -> dict[str, StoredArray]:
-    """Read the names and layouts of the arrays of a result.
-
-    Args:
-        size: of the file, bytes.
+    """Read the names and layouts of the arrays of a result from a file of `size` bytes.
 
     Raises:
         DamagedError: the file is cut short, or not a result.
@@ -114,7 +112,7 @@ def read_directory(file: _File, size: int) -> dict[str, StoredArray]:
         for (name, dtype, shape), checksum in zip(fields, checksums.tolist(), strict=True):
             arrays[name] = StoredArray(np.dtype(dtype), shape, end, begun, checksum)
             end += math.prod(shape) * arrays[name].dtype.itemsize
-    except Exception:  # whatever parsers make of damaged bytes
+    except Exception:  # parsers raise any error for damaged bytes
         raise DamagedError("its header is damaged or cut short") from None
     if end != size:
         raise DamagedError(f"it has {size:,} bytes of {end:,}")
@@ -126,18 +124,17 @@ def _bytes(array: NDArray[Any]) -> memoryview:
 
 
 class Store:
-    """Results of tasks by name, each a file that appears as a whole or not at all, with arrays by key.
+    """Results of tasks by name: files that appear whole or not at all, with arrays by key.
 
-    Small, so that it can be pickled. Methods may be called by several threads at once, and raise `ScratchError` if
-    results cannot be read or written. A checksum of each array reveals damage: `get` compares it, `rows` does not;
-    `is_sound` reads all of a result for that, as a resumed bake does.
+    A store can be pickled and used by several threads at once. Methods raise `ScratchError` if results cannot be read
+    or written. Checksums reveal damage: `get` compares them, `rows` does not, and `is_sound` compares all of a result.
 
-    Files are not synced, which would double the time of writing: what a process has written survives the process, and
-    checksums reveal what a power failure damaged.
+    Files are not synced, which would double the time of writing: written data survive the process, and checksums reveal
+    the damage of a power failure.
 
     Attributes:
         folder: on this machine, mounted by several, or at an address; created with the first result.
-        written, read: bytes, of this process and those that were counted for others.
+        written, read: bytes, also those that `count_bytes` adds for other processes.
     """
 
     def __init__(self, folder: Place) -> None:
@@ -153,7 +150,7 @@ class Store:
         return str(self.folder)
 
     def count_bytes(self, *, written: int = 0, read: int = 0) -> None:
-        """Count bytes that were written and read."""
+        """Add to the bytes written and read."""
         with self._lock:
             self.written += written
             self.read += read
@@ -178,18 +175,18 @@ class Store:
         return place.open(buffering=READ_AHEAD, size=size)
 
     def has(self, name: str) -> bool:
-        """Return whether a result exists; in a folder, also that it is not cut short."""
+        """Return whether a result exists and, in a folder, is not cut short."""
         place = self._place(name)
         with self._translated("read"):
             if isinstance(place, Address):
                 return place.is_file()
-            with contextlib.suppress(FileNotFoundError, NotADirectoryError, DamagedError), self._open(name) as file:
+            with contextlib.suppress(*MISSING), self._open(name) as file:
                 self._directory(name, file)
                 return True
         return False
 
     def put(self, name: str, arrays: Arrays) -> None:
-        """Write a result, or replace one of this name; raise `TypeError` for an array of anything but plain numbers."""
+        """Write or replace a result of arrays of plain numbers; raise `TypeError` for others."""
         self._forget(name)
         for key, array in arrays.items():
             if array.dtype.kind not in "biufc":
@@ -205,7 +202,7 @@ class Store:
         self.count_bytes(written=size)
 
     def get(self, name: str, keys: Collection[str] | None = None) -> dict[str, NDArray[Any]]:
-        """Read a result, or some of its arrays, and compare their checksums."""
+        """Read a result, or only arrays with these keys, and compare the checksums."""
         arrays = {}
         with self._reading(name) as (file, directory):
             for key in directory if keys is None else keys:
@@ -215,11 +212,11 @@ class Store:
         return arrays
 
     def rows(self, name: str, key: str, start: int, stop: int) -> NDArray[Any]:
-        """Read a range of rows of an array, which may end after it."""
+        """Read the rows of an array from `start` to `stop`, or to its end if that is less."""
         return self._runs(name, key, [start], [stop - start])
 
     def rows_at(self, name: str, key: str, index: NDArray[np.int64]) -> NDArray[Any]:
-        """Read rows of an array by their ascending numbers, at least one; rows in short gaps are read, too."""
+        """Read rows of an array by ascending numbers, at least one, each run with short gaps at once."""
         cuts = np.flatnonzero(np.diff(index) > GAP) + 1
         first = index[np.concatenate([[0], cuts])]
         count = index[np.concatenate([cuts, [len(index)]]) - 1] + 1 - first
@@ -230,7 +227,7 @@ class Store:
         return rows[index - np.repeat(first - (np.cumsum(count) - count), in_cut)]
 
     def _runs(self, name: str, key: str, first: Sequence[int], count: Sequence[int]) -> NDArray[Any]:
-        """Read runs of rows of an array, by the first row and the length of each, one after the other."""
+        """Read and concatenate runs of rows of an array, each by its first row and its length."""
         with self._reading(name) as (file, directory):
             stored = directory[key]
             row_bytes = math.prod(stored.shape[1:]) * stored.dtype.itemsize
@@ -243,7 +240,6 @@ class Store:
         return rows[:at]
 
     def shape(self, name: str, key: str) -> tuple[int, ...]:
-        """Return the shape of an array."""
         with self._reading(name) as (_, directory):
             return directory[key].shape
 
@@ -254,10 +250,9 @@ class Store:
             self._place(name).unlink(missing_ok=True)
 
     def is_sound(self, name: str) -> bool:
-        """Return whether a result exists and is undamaged; reads all of it."""
+        """Return whether a result exists and is undamaged, by reading all of it."""
         self._forget(name)
-        missing = contextlib.suppress(FileNotFoundError, NotADirectoryError, DamagedError)
-        with self._translated("read"), missing, self._open(name) as file:
+        with self._translated("read"), contextlib.suppress(*MISSING), self._open(name) as file:
             for stored in self._directory(name, file).values():
                 self.count_bytes(read=stored.check(_pieces(file, stored)))
             return True
@@ -268,7 +263,7 @@ class Store:
             self._directories.pop(name, None)
 
     def _directory(self, name: str, file: _File) -> dict[str, StoredArray]:
-        """Return the directory of an open file, which is read once."""
+        """Return the directory of an open file, which is cached until the size of the file changes."""
         size = file.seek(0, os.SEEK_END)
         with self._lock:
             known, directory = self._directories.get(name, (None, {}))
@@ -297,7 +292,7 @@ class Store:
 
     @contextlib.contextmanager
     def _translated(self, action: str) -> Iterator[None]:
-        """Turn errors of the system into `ScratchError`."""
+        """Translate an `OSError` into a `ScratchError`."""
         try:
             yield
         except OSError as error:
@@ -313,6 +308,7 @@ class Store:
 
 
 def _filled(file: _File, offset: int, array: NDArray[Any]) -> NDArray[Any]:
+    """Fill an array with the bytes of a file from `offset` on; raise `DamagedError` if the file ends before."""
     view = _bytes(array)
     file.seek(offset)
     while view:

@@ -23,11 +23,10 @@ from hypothesis import strategies as st
 import sparklod_cli as sparklod
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
 from sparklod_cli.api.converting import convert_file
+from sparklod_cli.bake.built_tree import BuiltTree, output_of, select, write_windows
 from sparklod_cli.bake.flow import bake, stage_shares
-from sparklod_cli.bake.in_memory import select
 from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
 from sparklod_cli.bake.simplifying import SimplifyGoal
-from sparklod_cli.bake.tree_output import BuiltTree, output_of, write_windows
 from sparklod_cli.codecs import encoder as encoding
 from sparklod_cli.codecs import ply, spz
 from sparklod_cli.codecs.encoder import windows_of

@@ -15,13 +15,13 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from sparklod_cli.bake import estimate, order, store
+from sparklod_cli.bake.built_tree import BuiltTree, output_of
 from sparklod_cli.bake.cluster import bake_side_by_side
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.in_blocks import InBlocks
 from sparklod_cli.bake.job import Job, LocalEngine, Task, cut_into_blocks
 from sparklod_cli.bake.settings import LARGE, Baked, BakeSettings, Resources
 from sparklod_cli.bake.store import Store
-from sparklod_cli.bake.tree_output import BuiltTree
 from sparklod_cli.codecs import ply
 from sparklod_cli.codecs.statistics import ALL
 from sparklod_cli.fitting.fit_settings import FitSettings
@@ -36,7 +36,6 @@ from sparklod_cli.model.splats import COLUMNS, Splats
 from sparklod_cli.model.transforms import Transform
 from sparklod_cli.system import machine
 from sparklod_cli.system.errors import InvalidSplatsError, OutOfMemoryError, SparklodError
-from sparklod_cli.system.output import Output
 from sparklod_cli.system.progress import Progress, silent
 from tests.bake.jobs import Loop, reader_of
 from tests.conftest import FIXTURES, real_scene
@@ -182,7 +181,7 @@ def small_windows(monkeypatch: pytest.MonkeyPatch) -> None:
 def built(folder: str, splats: Splats, how: BakeSettings, block: int, engine: Loop, *, in_chunks: bool) -> BuiltTree:
     """A tree in a store, of blocks of about this many splats."""
     job = Job(Store(Path(folder)), reader_of(Scene(splats)), how, ALL, in_chunks)
-    tree = BuiltTree(settings=how, out=Output(Path(folder) / "out", overwrite=False), options=how.options)
+    tree = output_of(Path(folder) / "out", how, overwrite=False)
     blocks = InBlocks(job, engine, block, 1, silent)
     blocks.build(tree)
     blocks.order(tree)

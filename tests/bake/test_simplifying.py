@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
-from sparklod_cli.bake.simplifying import CLOSE_BYTES, CLOSE_COUNT, SimplifyGoal, count_for
+from sparklod_cli.bake.simplifying import CLOSE_BYTES, CLOSE_COUNT, SimplifyGoal, fewest_for_psnr, largest_for_bytes
 from sparklod_cli.fitting.pictures import FittedNodes
-from sparklod_cli.lod.budget import parse_budget
 from sparklod_cli.lod.parts import RefinementOrder
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.system.progress import silent
@@ -22,14 +19,6 @@ SCENE = sparklod.Scene(random_splats(2000, sh_degree=1), up="-y")
 @pytest.fixture(scope="module")
 def tree() -> sparklod.Tree:
     return sparklod.build_lod(SCENE, method="quality", growth=2.0)
-
-
-def never(count: int) -> float:
-    raise AssertionError("a number of splats needs no measure")
-
-
-def splats_of(goal: SimplifyGoal, leaves: int, measure: Callable[[int], float] = never) -> tuple[int, float | None]:
-    return count_for(goal, leaves, bytes_of=measure, psnr_of=measure, progress=silent)
 
 
 def is_cut(nodes: np.ndarray, tree: LodTree) -> bool:
@@ -114,12 +103,12 @@ def test_the_file_is_as_large_as_it_may_be(most: int) -> None:
     def size(count: int) -> float:
         return 500 + 12 * count - (count // 7) % 3 + count**0.9
 
-    count, _ = splats_of(SimplifyGoal(max_bytes=most), 100_000, size)
+    count = largest_for_bytes(most, 100_000, size, silent)
     assert size(count) <= most < size(count + 1) + CLOSE_BYTES * most
 
 
 def test_the_fewest_splats_hold_a_psnr() -> None:
-    count, psnr = splats_of(SimplifyGoal(psnr=40), 1_000_000, lambda count: 10 * np.log10(count))
+    count, psnr = fewest_for_psnr(40, 1_000_000, lambda count: 10 * np.log10(count), silent)
     assert 10_000 <= count <= 10_000 * (1 + 2 * CLOSE_COUNT)
     assert psnr == pytest.approx(10 * np.log10(count))
 
@@ -139,8 +128,7 @@ def test_impossible_goals_are_refused(arguments: dict[str, float], text: str) ->
         SimplifyGoal(**arguments)  # type: ignore[arg-type]
 
 
-def test_goals_at_either_end_of_their_range() -> None:
-    assert splats_of(SimplifyGoal(to=parse_budget("1%")), 50) == (1, None)
-    assert splats_of(SimplifyGoal(max_bytes=10), 10, float) == (10, None)
+def test_sizes_at_either_end_of_their_range() -> None:
+    assert largest_for_bytes(10, 10, float, silent) == 10
     with pytest.raises(sparklod.FormatError, match="one splat takes 501 bytes in this format, more than 7; allow more"):
-        splats_of(SimplifyGoal(max_bytes=7), 9000, lambda count: 500.0 + count)
+        largest_for_bytes(7, 9000, lambda count: 500.0 + count, silent)
