@@ -1,6 +1,6 @@
-"""Files at addresses such as s3://bucket/scan.ply, which fsspec opens: they are used as paths are.
+"""Files at addresses such as s3://bucket/scan.ply, which fsspec opens and which are used like paths.
 
-Passwords and signatures in an address are never shown: its text is without them.
+The text of an address omits its passwords and signatures, which are never shown.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from urllib.parse import unquote, urlsplit
 from .errors import SparklodError, optional_import
 from .untrusted import redacted, without_secrets
 
-#: How addresses begin, chained ones too (simplecache::s3://). A letter and a colon alone are a drive of Windows.
+#: Beginning of an address, maybe a chained one (simplecache::s3://). A letter and a colon are a drive of Windows.
 ADDRESS = re.compile(r"((?:[A-Za-z][A-Za-z0-9+.-]*::)*[A-Za-z][A-Za-z0-9+.-]+)://")
 
-#: Bytes requested at once where little is read at a time; a request takes as long as some megabytes.
+#: Bytes of a request if callers read less at a time; a request takes as long as reading some megabytes.
 READ_AHEAD = 1 << 23
 
 
 @dataclass(frozen=True)
 class Address:
-    """A file or folder that fsspec opens; the attributes and methods are those of a `Path`.
+    """File or folder that fsspec opens, with attributes and methods of a `Path`.
 
-    Methods raise `OSError`, or `SparklodError` where a package is missing.
+    Methods raise `OSError`, or `SparklodError` if a package is missing.
 
     Attributes:
-        url: with passwords; the text of an address has none.
+        url: the address with its passwords, which its text omits.
     """
 
     url: str
@@ -56,7 +56,7 @@ class Address:
 
     @property
     def is_read_only(self) -> bool:
-        """Whether its service takes no files."""
+        """Whether its service only reads files."""
         return self.scheme in ("http", "https")
 
     @property
@@ -98,14 +98,14 @@ class Address:
         return int(size)
 
     def version(self) -> str:
-        """Return a text that changes with the file."""
+        """Return a text that changes when the file does."""
         with self._opened() as (system, path):
             return str(system.ukey(path))
 
     def open(
         self, mode: Literal["rb"] = "rb", buffering: int = READ_AHEAD, *, size: int | None = None
     ) -> io.BufferedReader:
-        """Open the file for reading; `size` is its size in bytes, if that is known."""
+        """Open the file for reading; a known `size` in bytes saves a request."""
         return io.BufferedReader(RangedFile(self.read, self.size() if size is None else size), buffering)
 
     def read(self, start: int, stop: int) -> bytes:
@@ -116,7 +116,7 @@ class Address:
         return data
 
     def write(self, pieces: Iterable[bytes | memoryview]) -> int:
-        """Write the file and return its size. It is sent when it is complete, so that no failure leaves half of it."""
+        """Write the file and return its size in bytes; only a complete file is sent."""
         import tempfile  # as every command loads this module
 
         with tempfile.NamedTemporaryFile(prefix="sparklod-") as file:
@@ -126,7 +126,7 @@ class Address:
         return size
 
     def send(self, file: str) -> None:
-        """Copy a file of this machine to the address, where it appears when it is complete."""
+        """Copy a local file to the address, where it appears when it is complete."""
         with self._opened() as (system, path):
             system.put_file(file, path)
 
@@ -150,7 +150,7 @@ class Address:
 
     @contextlib.contextmanager
     def _opened(self) -> Iterator[tuple[Any, str]]:
-        """Yield the file system of the address and its name there; errors inside name the address."""
+        """Yield the file system of the address and the path there; errors inside name the address."""
         system, path = _system(self.url)
         try:
             yield system, path
@@ -162,7 +162,7 @@ class Address:
             raise PermissionError(errno.EACCES, f"no permission ({self._shown(error)})", str(self)) from None
         except OSError as error:
             raise OSError(error.errno or errno.EIO, self._shown(error.strerror or error), str(self)) from None
-        except Exception as error:  # packages that talk to services have errors of their own
+        except Exception as error:  # packages of services raise their own errors
             raise OSError(errno.EIO, f"{type(error).__name__}: {self._shown(error)}", str(self)) from None
 
     def _shown(self, error: Exception | str) -> str:
@@ -170,7 +170,7 @@ class Address:
 
 
 class RangedFile(io.RawIOBase):
-    """A file whose bytes `read(start, stop)` requests when they are needed; `size` is in bytes."""
+    """Seekable file of `size` bytes, which the function `read(start, stop)` requests when needed."""
 
     def __init__(self, read: Callable[[int, int], bytes], size: int) -> None:
         self._read, self._size, self._at = read, size, 0
@@ -204,7 +204,7 @@ Place = Path | Address
 
 
 def place_of(text: str) -> Place:
-    """Return the address or path that a text names; file:// is a path."""
+    """Parse an address or a path; file:// is a path."""
     match = ADDRESS.match(text)
     if match is None:
         return Path(text)
@@ -214,17 +214,17 @@ def place_of(text: str) -> Place:
 
 
 def absolute(place: Place) -> Place:
-    """Return the path of a file for a process with another working folder; - stays as it is."""
+    """Return a place for processes with another current folder; - stays as it is."""
     return place if isinstance(place, Address) or str(place) == "-" else place.absolute()
 
 
 def size_of(place: Place) -> int:
-    """Return the size of a file in bytes, wherever it is."""
+    """Return the size of a local or remote file in bytes."""
     return place.size() if isinstance(place, Address) else place.stat().st_size
 
 
 def _cut(url: str) -> tuple[str, str]:
-    """Return an address before its query, and the query with its mark, which only those of the web have."""
+    """Split an address before its query, which only addresses of the web have."""
     if not url.lower().rpartition("::")[2].startswith(("http://", "https://")):
         return url, ""
     path, mark, query = url.partition("?")
@@ -233,16 +233,16 @@ def _cut(url: str) -> tuple[str, str]:
 
 @functools.lru_cache(maxsize=64)
 def _system(url: str) -> tuple[Any, str]:
-    """Return the file system that opens an address, and the name of the address there."""
+    """Return the file system that opens an address, and the path there."""
     with optional_import("addresses need fsspec and the package of their service", "cloud"):
         import fsspec
 
         try:
-            # Others write at the same time, so a list of files is old at once.
+            # Other processes write at the same time, so cached lists of files would be outdated.
             system, path = fsspec.core.url_to_fs(url, use_listings_cache=False)
         except ImportError:
             raise
-        except Exception as error:  # services parse their addresses, each in its way
+        except Exception as error:  # each package of a service parses addresses in its own way
             reason = f"{type(error).__name__}: {without_secrets(str(error), url)}"
             scheme = url.split("://", 1)[0]
             raise SparklodError(

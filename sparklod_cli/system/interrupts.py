@@ -1,4 +1,4 @@
-"""Signals that end a run: Ctrl-C, SIGTERM, and SIGHUP of a closed terminal."""
+"""Signals that end a run: Ctrl-C, SIGTERM, and SIGHUP from a closed terminal."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if h
 #: Exit status of an interrupted run: 128 + SIGINT, as in shells.
 INTERRUPTED = 130
 
-#: Packages that compile. An exception raised while LLVM calls back into Python is lost and may crash LLVM, and LLVM can
-#: take seconds to compile a kernel, during which Python handles no signal.
+#: Packages that compile. An exception raised while LLVM calls back into Python is lost and may crash LLVM; and LLVM may
+#: compile a kernel for seconds, during which Python handles no signal.
 COMPILERS = ("numba", "llvmlite")
 
 #: Seconds to wait for another thread to write the message.
 FAREWELL = 0.1
 
-#: Part of the error that Python prints of a second signal that came before the first one reset the handlers.
+#: Part of the error that Python prints about a second signal that came before the first one reset the handlers.
 RACE = "ignored due to race condition"
 
-#: What is written to the pipe of signals for an interruption that was lost, and the seconds until it is raised again.
+#: Byte written to the pipe of signals after a lost interruption, and seconds until it is raised again.
 LOST, PATIENCE = 0, 0.02
 
-#: Set when a signal has interrupted the run. Failures after that are its consequences: libraries, such as numpy's C
+#: Set when a signal has interrupted the run. Later failures are its consequences, as libraries, such as numpy's C
 #: modules, turn `KeyboardInterrupt` into errors of their own.
 came = threading.Event()
 
 
 class _Deferral:
-    """Whether a first Ctrl-C waits until the work ends by itself, see `deferred`."""
+    """State of `deferred`, in which the first Ctrl-C only asks the work to stop."""
 
     lasts = False  # such work is running
     asked = False  # the main thread has handled the first Ctrl-C
-    seen = False  # the watching thread has seen it, maybe before the main thread
+    seen = False  # the watching thread has seen it, perhaps before the main thread
 
 
 _deferral = _Deferral()
 
-#: The main thread and the watching thread may both end the process; only one of them writes the message.
+#: Held by the first thread that ends the process, which writes the message.
 _leaving = threading.Lock()
 
 
@@ -79,7 +79,7 @@ def handle() -> None:
         otherwise = sys.unraisablehook
 
         def raise_again(lost: sys.UnraisableHookArgs) -> None:
-            """Raise an interruption again that Python prints only: inside `__del__` or callbacks of weak references."""
+            """Raise an interruption again that Python only prints: inside `__del__` or callbacks of weak references."""
             if lost.exc_type is OSError and RACE in str(lost.exc_value):  # it came together with the first one
                 _leave()
             if lost.exc_type is not KeyboardInterrupt:
@@ -94,9 +94,9 @@ def handle() -> None:
 
 @contextlib.contextmanager
 def deferred() -> Iterator[Callable[[], bool]]:
-    """Let work stop early by itself at the first Ctrl-C; yield a function that returns whether it has to stop.
+    """Let work end in its own way after the first Ctrl-C; yield a function that returns True from then on.
 
-    `came` is set then, too. A second Ctrl-C and other signals interrupt as usual, and so does a Ctrl-C after the
+    That Ctrl-C also sets `came`. A second one and other signals interrupt as usual, and so does a Ctrl-C after the
     context. Without `handle`, as in a library, nothing is deferred.
     """
     _deferral.asked = _deferral.seen = False
@@ -108,13 +108,13 @@ def deferred() -> Iterator[Callable[[], bool]]:
 
 
 def ignore() -> None:
-    """Ignore the signals; called at the end of the process, when all work is done."""
+    """Ignore the signals from now on: the process ends, and all work is done."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
 
 
 def _watch(reader: int, handled: list[signal.Signals]) -> None:
-    """Watch for signals, in a thread of its own, and end the process while the main thread is inside LLVM."""
+    """Read signals from a pipe, in a thread of its own, to end the process even while the main thread is in LLVM."""
     main = threading.main_thread().ident
     assert main is not None
     while True:
@@ -140,13 +140,13 @@ def _leave_if_compiling() -> None:
 
 
 def leave_if_lost() -> None:
-    """End the process if a library has lost the exception of an interruption; called before long work."""
+    """End the process if a library has swallowed an interruption; called before long work."""
     if came.is_set() and not _deferral.asked:
         _leave()
 
 
 def _leave() -> NoReturn:
-    """Write the message and end the process without clean-up."""
+    """Report the interruption and end the process without clean-up."""
     # A second thread, or a second signal in the same one, does not wait for the lock.
     if _leaving.acquire(blocking=False):
         with contextlib.suppress(OSError):  # not `sys.stderr`, whose lock the other thread may hold

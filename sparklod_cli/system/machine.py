@@ -1,23 +1,24 @@
-"""Memory, processors and Python packages of this process, with the limits that a container sets.
+"""Memory and processors of this machine, within the limits of its container, and Python packages.
 
-Functions about memory and processors return None if the system does not provide the figure; none of them raises.
+Functions about memory and processors return None for an unknown figure and never raise.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-#: Least value that means "no limit" in cgroups version 1, where the kernel writes the largest multiple of a page.
+#: Values from this one on mean "no limit" in cgroups version 1, which has the largest multiple of a page.
 UNLIMITED = 1 << 60
 
 
 def total_memory() -> int | None:
-    """Return bytes of memory of the machine, or the limit of the container if that is lower."""
+    """Return the memory of the machine in bytes, or the limit of the container if it is lower."""
     physical = _meminfo("MemTotal")
     if physical is None:
         try:
@@ -28,7 +29,7 @@ def total_memory() -> int | None:
 
 
 def available_memory() -> int | None:
-    """Return bytes that can be allocated before the system swaps or the container kills the process."""
+    """Return the bytes that can be allocated before the system swaps or the container kills the process."""
     available = _meminfo("MemAvailable")
     if available is None:
         return None
@@ -36,7 +37,7 @@ def available_memory() -> int | None:
 
 
 def processor_quota() -> float | None:
-    """Return processor time that a container grants, in processors, such as 1.5; None without a limit."""
+    """Return the processor time that a container grants, in processors (1.5); None without a limit."""
     found = []
     for folder in _groups("cpu"):
         words = _text(folder / "cpu.max").split()  # version 2
@@ -48,15 +49,12 @@ def processor_quota() -> float | None:
 
 
 def _meminfo(name: str) -> int | None:
-    for line in _text(Path("/proc/meminfo")).splitlines():
-        words = line.split()
-        if words[:1] == [f"{name}:"] and words[1].isdigit():
-            return int(words[1]) * 1024
-    return None
+    found = re.search(rf"^{name}:\s*([0-9]+)\s", _text(Path("/proc/meminfo")), re.MULTILINE)
+    return int(found[1]) * 1024 if found else None
 
 
 def _memory_limits() -> Iterator[tuple[int, int]]:
-    """Yield memory limit and usage in bytes of each cgroup of this process."""
+    """Yield the memory limit and the usage, in bytes, of each cgroup of this process."""
     for folder in _groups("memory"):
         for limit_name, used_name in (
             ("memory.max", "memory.current"),  # version 2
@@ -89,25 +87,25 @@ def _text(path: Path) -> str:
 
 
 def release_memory() -> None:
-    """Return freed memory to the system; glibc keeps up to 200 MB for later."""
-    import ctypes  # which most commands do without
+    """Return freed memory to the system, of which glibc keeps up to 200 MB."""
+    import ctypes  # which most commands do not need
 
-    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library; Windows has no name for it
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library, or Windows
         ctypes.CDLL(None).malloc_trim(0)
 
 
-#: Folder that this package is in: a checkout, or one of installed packages.
+#: Folder of this package: a checkout, or one of installed packages.
 _HOME = Path(__file__).parents[2]
 
 #: Name of this distribution, for pip.
 DISTRIBUTION = "sparklod"
 
-#: Files in the environment of a program that pipx or `uv tool` installed.
+#: Files in environments that pipx or `uv tool` created.
 _PIPX, _UV_TOOL = "pipx_metadata.json", "uv-receipt.toml"
 
 
 def pip_install(*packages: str, options: Sequence[str] = ()) -> str:
-    """Return a command line that installs packages into the environment of this interpreter."""
+    """Return the command line that installs packages into the environment of this interpreter."""
     import shlex
 
     environment = Path(sys.prefix)
@@ -119,7 +117,7 @@ def pip_install(*packages: str, options: Sequence[str] = ()) -> str:
 
 
 def _pip(environment: Path) -> list[str]:
-    """Return the words of a command line for the pip of an environment, or for uv if it has no pip."""
+    """Return the words that call the pip of an environment, or uv if it has no pip."""
     import shutil
     from importlib.util import find_spec
 
@@ -138,14 +136,14 @@ def _pip(environment: Path) -> list[str]:
 
 
 def install_hint(extra: str = "", *, package: str = "", options: Sequence[str] = ()) -> str:
-    """Return a command line that installs the requirements of this installation of sparklod, or of one of its extras.
+    """Return the command line that installs the requirements of sparklod, or of one of its extras.
 
-    No package index is known to have sparklod. So the command names the checkout that it was installed from, or else
-    the packages that are missing.
+    No package index is known to have sparklod. So the command names the checkout from which it was installed, or else
+    the missing packages.
 
     Args:
         package: the only package to install, in the version that the extra requires; empty for all of them.
-        options: of pip.
+        options: those of pip.
     """
     from importlib import metadata  # takes long to load
 
@@ -168,7 +166,7 @@ def install_hint(extra: str = "", *, package: str = "", options: Sequence[str] =
 
 
 def _checkout() -> Path | None:
-    """Return the folder of the repository that holds this package, or that it was installed from, if any."""
+    """Return the folder of the repository that holds this package or from which it was installed, if any."""
     import json
     from importlib import metadata
     from urllib.parse import unquote, urlsplit
@@ -184,12 +182,12 @@ def _checkout() -> Path | None:
 
 @dataclass(frozen=True)
 class Required:
-    """A distribution that another one requires.
+    """Distribution that another one requires.
 
     Attributes:
-        least: the minimum version; empty for any.
-        version: the installed version; None if it is not installed.
-        source: the requirement of pip that brings it, if it names another distribution: "imageio[ffmpeg]>=2.31".
+        least: minimum version; empty for any.
+        version: installed version; None if it is not installed.
+        source: requirement for pip if the distribution comes with the extra of another one: "imageio[ffmpeg]>=2.31".
     """
 
     name: str
@@ -209,14 +207,14 @@ class Required:
 
     @property
     def state(self) -> str:
-        """The state for display: "2.4.6", "is missing", or "1.20, older than 1.26"."""
+        """State for display: "2.4.6", "is missing", or "1.20, older than 1.26"."""
         if self.version is None:
             return "is missing"
         return f"{self.version}, older than {self.least}" if self.missing else self.version
 
 
 def required_by(distribution: str, extra: str = "") -> Iterator[Required]:
-    """Yield the requirements of a distribution or, if an extra is given, of the extra alone.
+    """Yield the requirements of a distribution, or those of one of its extras alone.
 
     Raises:
         importlib.metadata.PackageNotFoundError: the distribution is not installed.

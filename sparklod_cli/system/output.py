@@ -1,8 +1,8 @@
-"""Outputs: a file, a file and its siblings, standard output, a device or an address. All files appear, or none.
+"""Outputs: a file, a file with siblings, standard output, a device or an address. All files appear, or none.
 
 On systems with unnamed files (Linux), a killed writer of one file leaves nothing behind. Elsewhere the file has a
-temporary name. Files that belong together are written to a hidden folder beside their places. Writers lock such a file
-or folder, so that the next run can recognise and remove the remains of killed writers.
+temporary name. Files that belong together are written to a hidden folder next to their final places. Writers lock
+such a file or folder, so that the next run can recognise and remove the remains of killed writers.
 """
 
 from __future__ import annotations
@@ -34,20 +34,17 @@ except ImportError:  # Windows, where a file that is open cannot be removed by o
 #: Names of files, as paths within the folder of an output ("0_0/meta.json"), and their contents.
 Files = Iterable[tuple[str, Iterable[bytes]]]
 
-#: Bytes written to try a folder, a block of most file systems: less may fit into a full one.
-_TRIED_BYTES = 4096
-
 
 @dataclass(frozen=True)
 class Siblings:
-    """Names of the files that a format writes beside the first file of an output: chunks, images, or folders of them.
+    """Names of the files that a format writes in addition to the first file of an output: chunks, images, or folders.
 
     Attributes:
-        is_member: whether a name ("0_0/meta.json") is one of them.
-        is_folder: whether a name is one of their folders; None where they are in the folder of the first file.
+        is_member: returns whether a sibling may have this name ("0_0/meta.json").
+        is_folder: returns whether a folder of siblings may have this name; None if they share the first file's folder.
         first_folder: the folder that every output has.
-        named: reads all names in an existing first file and in the files that it names; raises `OSError` or
-            `FormatError` if it cannot be read. None: every file of such a name belongs to it.
+        named: yields the names of all siblings from an existing first file and from siblings; raises `OSError` or
+            `FormatError` if a file cannot be read. None if all files with such names are siblings.
     """
 
     is_member: Callable[[str], bool]
@@ -56,10 +53,10 @@ class Siblings:
     named: Callable[[Place], Iterable[str]] | None = None
 
     def existing(self, target: Place) -> list[str]:
-        """Return the names of the files beside a first file that could be its siblings, whether it names them or not.
+        """Return the names of existing files that could be siblings of a first file, whether it names them or not.
 
         Raises:
-            OutputError: the service does not list the files at an address.
+            OutputError: the service of an address does not list files.
         """
         found = list[str]()
         if isinstance(target, Address):
@@ -77,32 +74,32 @@ class Siblings:
         return sorted(filter(self.is_member, found), key=lambda name: (len(name), name))
 
     def former(self, target: Place, existing: list[str]) -> list[str]:
-        """Return the `existing` files that belong to a former output, which an overwrite removes or replaces."""
+        """Return those of the `existing` files that belong to a former output, which an overwrite replaces."""
         if self.named is None:
             return existing
         names, known = dict[str, None](), set(existing)
-        with contextlib.suppress(OSError, FormatError):  # the names that were read before the error count
+        with contextlib.suppress(OSError, FormatError):  # names that were read before the error are valid
             for name in self.named(target):
                 names[name] = None
         return [name for name in names if name in known]
 
 
 class Output(contextlib.AbstractContextManager["Output"]):
-    """An output, tried when it is made, before any work; its files appear at the end of the context, all or none.
+    """Output whose files appear at the end of the context, all or none; it is checked at once, before any work.
 
-    With `overwrite`, existing files are replaced, and files of a former output without a successor are removed. An
-    error or an interrupt leaves the former files. See `publish` for a kill. At an address, files are sent one by
+    With `overwrite`, existing files are replaced, and surplus files of a former output are removed. An error or an
+    interrupt leaves the former files; `publish` describes the effect of a kill. At an address, files are sent one by
     one: the former first file is removed first, the new one must be written last, and an error removes the sent files.
 
     Args:
-        place: of the file, or of the first file; a symbolic link is followed. - is standard output. A pipe or a device
+        place: path or address of the first file; a symbolic link is followed. - is standard output. A pipe or a device
             is never replaced.
-        siblings: names of the files beside the first one; None for an output of one file.
+        siblings: names of its siblings; None for an output of one file.
         may_end: the reader of standard output may close it early, see `write_stdout`.
 
     Raises:
-        OutputError: it cannot be written, see `check_writable`; or it cannot take several files, siblings exist, or
-            another folder is in their way.
+        OutputError: the place cannot be written, see `check_writable`, or cannot take several files; siblings exist, or
+            another folder has their name.
     """
 
     def __init__(
@@ -124,10 +121,10 @@ class Output(contextlib.AbstractContextManager["Output"]):
             check_writable(place, overwrite=overwrite)
 
     def write(self, name: str, pieces: Iterable[bytes]) -> int:
-        """Write a file and return its size in bytes; further calls continue the file of an output of one.
+        """Write a file and return its size in bytes; without siblings, all calls write to the same file.
 
         Args:
-            name: in the folder of the output; the name of no sibling means the first file.
+            name: path in the folder of the output; a name that no sibling may have means the first file.
         """
         if self.place == DASH:
             return write_stdout(pieces, may_end=self._may_end)
@@ -214,7 +211,7 @@ class Output(contextlib.AbstractContextManager["Output"]):
         if siblings.is_folder is not None:
             self._check_folder(siblings.first_folder)
             for name in existing if is_remote else ():
-                self._check_folder(name.rpartition("/")[0])  # all of them now: nothing can be undone there later
+                self._check_folder(name.rpartition("/")[0])  # in advance, as nothing can be undone at an address
         else:
             for name in existing:
                 place = self.target.parent / name
@@ -222,14 +219,14 @@ class Output(contextlib.AbstractContextManager["Output"]):
                     raise _taken(place)
 
     def _find_former(self, siblings: Siblings) -> list[str]:
-        """Find the files of a former output, and return all files there that have names of siblings."""
+        """Find the files of a former output; return all existing files that have names of siblings."""
         existing = siblings.existing(self.target)
         self._former = siblings.former(self.target, existing)
         self._ours = {"", *(name.rpartition("/")[0] for name in self._former)}
         return existing
 
     def _check_folder(self, folder: str) -> None:
-        """Raise `OutputError` if a folder is neither empty nor of the former output."""
+        """Raise `OutputError` if a folder has files and is not part of the former output."""
         if folder in self._ours:
             return
         place = self.target.parent / folder
@@ -250,18 +247,18 @@ class Output(contextlib.AbstractContextManager["Output"]):
 
 
 def write_file(place: Place, pieces: Iterable[bytes], *, overwrite: bool, may_end: bool = False) -> int:
-    """Write an output of one file, see `Output`, and return its size in bytes."""
+    """Write an `Output` of one file; return its size in bytes."""
     with Output(place, overwrite=overwrite, may_end=may_end) as out:
         return out.write(place.name, pieces)
 
 
 def check_writable(place: Place, *, overwrite: bool, tried: bool = True) -> None:
-    """Raise `OutputError` if a file cannot be written: a folder or another file is in its way, or it has no room.
+    """Raise `OutputError` if a file cannot be written: its name is taken, or permission or room is missing.
 
-    At an address, its service has to answer; permission to write is not tried, as others would see the file.
+    The service of an address has to answer; permission is not tried there, as others would see the file.
 
     Args:
-        tried: try permission and room by a temporary file, see `try_place`.
+        tried: try permission and room with a temporary file, see `try_place`.
     """
     try:
         if isinstance(place, Address):
@@ -283,9 +280,9 @@ def check_writable(place: Place, *, overwrite: bool, tried: bool = True) -> None
 
 
 def try_place(path: Path, *, least: int = 0) -> None:
-    """Raise `OutputError` if a file or a folder, of at least `least` bytes, cannot be written or replaced.
+    """Raise `OutputError` if a file or a folder of at least `least` bytes cannot be written or replaced.
 
-    Permission and room are tried by a temporary file in its folder, or in the nearest existing folder on the way to it.
+    A temporary file tries permission and room in its folder, or in the nearest existing folder above.
     """
     try:
         target = Path(os.path.realpath(path))
@@ -294,9 +291,9 @@ def try_place(path: Path, *, least: int = 0) -> None:
             raise OutputError(f"cannot write {path}: {nearest} is a file, not a folder")
         for name in target.relative_to(nearest).parts:
             with contextlib.suppress(FileNotFoundError):
-                (nearest / name).lstat()  # raises where the file system takes no such name
+                (nearest / name).lstat()  # raises if the file system does not accept the name
         with contextlib.closing(NewFile(nearest / "tried", overwrite=False)) as new:
-            new.file.write(bytes(_TRIED_BYTES))
+            new.file.write(bytes(4096))  # a block of most file systems: fewer bytes may fit into a full one
         if os.path.lexists(target):
             check_replaceable(target)
         free = shutil.disk_usage(nearest).free if least else 0
@@ -323,17 +320,14 @@ HAS_LOCKS = fcntl is not None
 #: Names of incomplete files, and of folders of several of them.
 PARTS, STAGES = ".sparklod-{}.part", ".sparklod-{}.parts"
 
-#: Folders are removed with all that is in them, so their names must be ours to the letter.
-_STAGE = re.compile(r"\.sparklod-[0-9a-f]{16}\.parts")
-
-#: The folder inside the hidden one for the files that are being replaced.
+#: Folder inside the hidden one for the files that are replaced.
 FORMER = "former"
 
 
 def lock(descriptor: int, *, wait: bool = True) -> bool:
-    """Lock a file or folder until it is closed or its process ends; return False if another process has locked it.
+    """Lock a file or folder until it is closed or this process ends; return True, also on systems without locks.
 
-    Without `wait`, at once. Where there are no locks, return True.
+    Without `wait`, return False if another process has locked it.
     """
     if fcntl is not None:
         try:
@@ -347,9 +341,9 @@ def lock(descriptor: int, *, wait: bool = True) -> bool:
 
 @functools.lru_cache(256)
 def sweep(folder: Path) -> None:
-    """Remove the remains of killed writers from a folder; once, as thousands of files may be written there.
+    """Remove the remains of killed writers from a folder: files and folders of this user that no process has locked.
 
-    These are files and folders of this user that no process has locked.
+    A folder is swept only once, as thousands of files may be written to it.
     """
     with contextlib.suppress(OSError):
         for path in [*folder.glob(PARTS.format("*")), *folder.glob(STAGES.format("*"))]:
@@ -362,7 +356,8 @@ def sweep(folder: Path) -> None:
                 descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
                 stack.callback(os.close, descriptor)
                 status = os.fstat(descriptor)
-                is_stage = stat.S_ISDIR(status.st_mode) and _STAGE.fullmatch(path.name)
+                # Folders are removed with all of their files, so their names must match exactly.
+                is_stage = stat.S_ISDIR(status.st_mode) and re.fullmatch(r"\.sparklod-[0-9a-f]{16}\.parts", path.name)
                 if (is_stage or stat.S_ISREG(status.st_mode)) and status.st_uid == os.geteuid():
                     fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                     if is_stage:
@@ -371,27 +366,25 @@ def sweep(folder: Path) -> None:
                         path.unlink()
 
 
-#: The flag that opens an unnamed file in a folder; None where the system has none.
+#: Flag that opens an unnamed file in a folder; None on systems without such files.
 UNNAMED: int | None = getattr(os, "O_TMPFILE", None)
 
-#: The folder of open files by descriptor, from which an unnamed file is linked to its name.
+#: Folder of open files by descriptor, from which an unnamed file is linked to its name.
 OPEN_FILES = Path("/proc/self/fd")
 
 #: For reading and writing bytes; not inherited by child processes.
 _FLAGS = os.O_RDWR | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0)
 
-_COPY_BYTES = 1 << 20  # per read when a file is copied
-
 
 def write_atomically(target: Path, pieces: Iterable[bytes | memoryview], *, overwrite: bool, sync: bool = True) -> int:
-    """Write a file that appears only when it is complete, and return its size in bytes.
+    """Write a file that appears only when it is complete; return its size in bytes.
 
     A new file gets the permissions that the umask allows. A replacement gets the permissions of the file it replaces,
     except set-user-id, set-group-id and sticky, and never has more while it is written.
 
     Args:
-        target: path of the file; a symbolic link would be replaced, not followed.
-        sync: wait until it is on the disk. Otherwise it may be damaged after a power failure, though not after a kill.
+        target: path of the file; a symbolic link is replaced, not followed.
+        sync: wait until it is on the disk. Otherwise a power failure may damage it, but not a kill.
 
     Raises:
         FileExistsError: the file exists, and `overwrite` is not set.
@@ -403,11 +396,11 @@ def write_atomically(target: Path, pieces: Iterable[bytes | memoryview], *, over
 
 
 class NewFile:
-    """A file that is filled, and gets its name by `publish`; until then, `close` leaves nothing behind.
+    """File that gets its name when `publish` is called; before, `close` removes it.
 
     Attributes:
         file: open for writing and reading.
-        part: its temporary name; None for an unnamed file.
+        part: temporary path; None for an unnamed file.
     """
 
     def __init__(self, target: Path, *, overwrite: bool, unnamed: bool = True) -> None:
@@ -415,7 +408,7 @@ class NewFile:
         self._target, self._overwrite = target, overwrite
         self.part: Path | None = None
         mode = _replaced_mode(target, overwrite)
-        mode = 0o666 if mode is None else mode & 0o600  # never more than that of the complete file
+        mode = 0o666 if mode is None else mode & 0o600  # never more permissions than the complete file
         if unnamed and UNNAMED is not None and OPEN_FILES.exists():
             with contextlib.suppress(OSError):
                 self.file = os.fdopen(os.open(target.parent, UNNAMED | os.O_RDWR | os.O_CLOEXEC, mode), "w+b")
@@ -431,7 +424,7 @@ class NewFile:
             os.close(descriptor)
 
     def publish(self, *, sync: bool = True) -> None:
-        """Give the file, which is complete, its name; raise `FileExistsError` if that is taken."""
+        """Give the complete file its name; raise `FileExistsError` if it is taken and `overwrite` is not set."""
         self.file.flush()
         number, target = self.file.fileno(), self._target
         if sync:
@@ -444,8 +437,8 @@ class NewFile:
                 self.file.close()  # Windows cannot rename an open file
             rename(self.part, target, self._overwrite)
             return
-        target.parent.mkdir(parents=True, exist_ok=True)  # another run that failed may have removed it as empty
-        # src_dir_fd has no other effect than that Python follows the symbolic link in /proc.
+        target.parent.mkdir(parents=True, exist_ok=True)  # a failed run may have removed the empty folder
+        # The only effect of src_dir_fd is that Python follows the symbolic link in /proc.
         link = functools.partial(os.link, OPEN_FILES / str(number), src_dir_fd=number, follow_symlinks=True)
         try:
             mode = _replaced_mode(target, self._overwrite)
@@ -471,11 +464,11 @@ class NewFile:
         except OSError:  # a file system without links
             self.file.seek(0)
             with contextlib.closing(NewFile(target, overwrite=self._overwrite, unnamed=False)) as copy:
-                shutil.copyfileobj(self.file, copy.file, _COPY_BYTES)
+                shutil.copyfileobj(self.file, copy.file)
                 copy.publish()
 
     def close(self) -> None:
-        """Close the file; remove it, if it has no name of its own."""
+        """Close the file; remove it unless it was published."""
         try:
             self.file.close()
         finally:
@@ -484,7 +477,7 @@ class NewFile:
 
 
 def check_replaceable(path: Path) -> None:
-    """Raise `OSError` where a file or folder cannot be replaced, though others can be written beside it.
+    """Raise `OSError` if a file or folder cannot be replaced although its folder can be written.
 
     Something is mounted on it, it belongs to another user in a folder such as /tmp, or it is marked as immutable.
     """
@@ -497,13 +490,13 @@ def check_replaceable(path: Path) -> None:
     if stat.S_ISREG(status.st_mode):
         try:
             os.close(os.open(path, _FLAGS | getattr(os, "O_NONBLOCK", 0)))
-        except OSError as error:  # a file that is only read may be replaced
+        except OSError as error:  # a read-only file may be replaced
             if error.errno == errno.EPERM:
                 raise
 
 
 def _replaced_mode(target: Path, overwrite: bool) -> int | None:
-    """Return permissions of the file that will be replaced; None if there is none."""
+    """Return the permissions of the file that is replaced; None for a new file."""
     try:
         return stat.S_IMODE(target.stat().st_mode) & 0o777 if overwrite else None
     except FileNotFoundError:
@@ -511,7 +504,7 @@ def _replaced_mode(target: Path, overwrite: bool) -> int | None:
 
 
 def rename(temporary: Path, target: Path, overwrite: bool) -> None:
-    """Give a complete file its name; raise `FileExistsError` if that is taken and `overwrite` is not set."""
+    """Rename a complete file; raise `FileExistsError` if the name is taken and `overwrite` is not set."""
     if overwrite:
         temporary.replace(target)
         return
@@ -527,20 +520,18 @@ def rename(temporary: Path, target: Path, overwrite: bool) -> None:
 
 @contextlib.contextmanager
 def created(folder: Path) -> Iterator[None]:
-    """Create a folder and its parents for a context; at its end, new folders that are empty are removed."""
+    """Create a folder and its parents; at the end of the context, remove those of them that are empty."""
     new = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
         yield
     finally:
-        with contextlib.suppress(OSError):  # the first that is not empty ends this
-            for each in new:
-                each.rmdir()
+        _remove_empty(reversed(new))
 
 
 @contextlib.contextmanager
 def staged(folder: Path) -> Iterator[Path]:
-    """Create a locked, hidden folder in a folder for files that belong together; it is removed at the end."""
+    """Create a hidden, locked folder for files that belong together; it is removed at the end of the context."""
     sweep(folder)
     descriptor: int | None = None
     while True:
@@ -563,21 +554,21 @@ def staged(folder: Path) -> Iterator[Path]:
 
 
 def publish(stage: Path, names: Collection[str], header: str, overwrite: bool, outdated: Iterable[str]) -> None:
-    """Give files that were added to a hidden folder their names beside it: all of them, or none.
+    """Move files from a hidden folder to the folder around it: all of them, or none.
 
-    A former header is moved away before any other file is touched, and the new one is the last to get its name: for
-    some milliseconds there is none. An error or an interrupt at any time leaves the former files; a kill within these
-    milliseconds leaves new files without a header. A folder that becomes empty is removed, too; other files in it are
-    not touched. Permissions are those of `write`.
+    The former header is moved away before any other file is touched, and the new one comes last: for some
+    milliseconds there is none. An error or an interrupt at any time leaves the former files; a kill within these
+    milliseconds leaves new files without a header. Folders that become empty are removed; other files in them are
+    not touched. Permissions are those of `write_atomically`.
 
     Args:
-        names: all files that were added.
+        names: all files in the hidden folder.
         header: the file that readers open first.
-        outdated: existing files that are removed where `overwrite` is set.
+        outdated: existing files to be removed if `overwrite` is set.
 
     Raises:
-        FileExistsError: a file exists, and `overwrite` is not set; or something else, such as a link, is in the place
-            of a folder. The error has the path.
+        FileExistsError: a file exists and `overwrite` is not set, or a folder's name belongs to something else, such as
+            a link. The error has the path.
     """
     folder, written = stage.parent, {*names}
     names = [*(name for name in names if name != header), header]
@@ -604,19 +595,20 @@ def publish(stage: Path, names: Collection[str], header: str, overwrite: bool, o
 
 
 def _folders_of(names: Iterable[str]) -> list[str]:
-    """Return the folders of files, outermost first."""
+    """Return the folders that hold these files, outermost first."""
     found = {str(parent) for name in names for parent in PurePosixPath(name).parents if parent.name}
     return sorted(found, key=lambda folder: (folder.count("/"), folder))
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
+    """Remove those of these folders, outermost first, that are empty or have only empty ones of these."""
     for folder in reversed(list(folders)):
         with contextlib.suppress(OSError):
             folder.rmdir()
 
 
 def _put_aside(stage: Path, name: str) -> None:
-    """Move a file that will be replaced into the hidden folder; the new one gets its permissions."""
+    """Move a file that is replaced into the hidden folder; give its permissions to the new one."""
     former, part = stage.parent / name, stage / name
     with contextlib.suppress(FileNotFoundError):
         mode = former.stat().st_mode
@@ -629,7 +621,7 @@ def _put_aside(stage: Path, name: str) -> None:
 
 
 def _undo(stage: Path, names: Collection[str]) -> None:
-    """Take the names of new files away again and give former files theirs back, the header's, the last name, at last.
+    """Remove new files from their final places and move former files back; the header, the last name, comes last.
 
     The folders show which steps were done, so that an interrupt between two steps is undone, too.
     """

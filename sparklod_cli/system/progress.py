@@ -1,4 +1,4 @@
-"""`Progress`, the callback with which long operations report their progress."""
+"""`Progress`, the callback to which long operations report their progress."""
 
 from __future__ import annotations
 

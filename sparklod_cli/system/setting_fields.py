@@ -1,6 +1,6 @@
-"""Declarations of settings: a field of a dataclass makes the option of the command line, its help and the API's check.
+"""Declarations of settings: a dataclass field declares an option, its help, and the check of its value in the API.
 
-Imports nothing heavy: `--help` reads the declarations.
+Imports nothing heavy, as `--help` reads the declarations.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-#: Key of a `Setting` in the metadata of its field.
+#: Key of the `Setting` in the metadata of a field.
 SETTING = "setting"
 
 #: Largest integer that arrays hold.
@@ -24,10 +24,10 @@ class Range:
     """Range of a number.
 
     Attributes:
-        least, most: ends that belong to it; None for no end.
-        above, below: ends that do not belong to it; None for no end.
-        whole: the numbers are integers.
-        unit: placeholder of a number in `--help`.
+        least, most: inclusive ends; None for no end.
+        above, below: exclusive ends; None for no end.
+        whole: only integers are in the range.
+        unit: placeholder for the number in `--help`.
     """
 
     least: float | None = None
@@ -44,7 +44,7 @@ class Range:
         return " and ".join(f"{words} {end}" for words, end in ends if end is not None)
 
     def check(self, name: str, value: Any) -> None:
-        """Raise TypeError unless a value is a number, and ValueError unless it is in the range."""
+        """Raise TypeError for a value that is not a number, and ValueError for one outside the range."""
         if isinstance(value, bool) or not isinstance(value, numbers.Integral if self.whole else numbers.Real):
             raise TypeError(f"{name} is {value!r}; give a {'whole ' * self.whole}number, {self}")
         number: Any = value  # abstract numbers have no operators for mypy
@@ -67,12 +67,12 @@ def whole(least: int, most: int | None = None, unit: str = "N") -> Range:
 
 @dataclass(frozen=True)
 class Quantity:
-    """Number or list as text with a unit, such as 20Mbit.
+    """Number or list, given as text with a unit, such as 20Mbit.
 
     Attributes:
-        unit: placeholder of the text in `--help`.
-        parse: returns the value of a text, or raises a ValueError that says what is wrong.
-        range: of the value; None for any.
+        unit: placeholder for the text in `--help`.
+        parse: returns the value of a text, or raises ValueError with a message for the user.
+        range: allowed values; None for any.
     """
 
     unit: str
@@ -85,12 +85,12 @@ class Setting:
     """Declaration of a setting.
 
     Attributes:
-        help: of the option, which documents the field, too. It says the default where the value does not.
+        help: help text of the option, which also documents the field; it names a default that differs from the value.
         kind: a `Range`, a `Quantity`, a tuple of choices, or a parameter type of the command line; None for text, and
             for flags, whose default is False.
-        name: of the parameter of a command, from which its flag is made; empty for that of the field.
+        name: name of the command's parameter, which gives the flag; empty for the name of the field.
         only_api: the command line has no such option.
-        attributes: further ones of the option.
+        attributes: further attributes of the option.
     """
 
     help: str
@@ -103,13 +103,13 @@ class Setting:
 def setting(
     help: str, kind: Any = None, default: Any = None, *, name: str = "", only_api: bool = False, **attributes: Any
 ) -> Any:
-    """Return a dataclass field with a `Setting`, whose attributes the arguments are, and a default value."""
+    """Return a dataclass field with this default and a `Setting` of the other arguments."""
     declared = Setting(help, kind, name, only_api, attributes)
     return field(default=default, metadata={SETTING: declared})
 
 
 def setting_of(kind: type[Any], name: str, **attributes: Any) -> Any:
-    """Return a field with the declaration of a field of another dataclass, and further attributes of the option."""
+    """Return a field declared as a field of another dataclass is, with further attributes of the option."""
     declared = next(each for each in dataclasses.fields(kind) if each.name == name)
     own: Setting = declared.metadata[SETTING]
     changed = dataclasses.replace(own, attributes={**own.attributes, **attributes})
@@ -117,7 +117,7 @@ def setting_of(kind: type[Any], name: str, **attributes: Any) -> Any:
 
 
 def settings_in(kind: type[Any]) -> Iterator[tuple[dataclasses.Field[Any], Setting | None]]:
-    """Yield each field of a dataclass that is an option, with its declaration, or a group of options, with None."""
+    """Yield the fields of a dataclass that are options, with their declarations, or groups of options, with None."""
     for each in dataclasses.fields(kind):
         declared = each.metadata.get(SETTING)
         if (declared is not None and not declared.only_api) or dataclasses.is_dataclass(each.default_factory):
@@ -125,10 +125,10 @@ def settings_in(kind: type[Any]) -> Iterator[tuple[dataclasses.Field[Any], Setti
 
 
 class CheckedSettings:
-    """Base of dataclasses of settings: their values are checked, and their docstrings have the help of the fields.
+    """Base of dataclasses of settings, which checks their values and adds the help of the fields to their docstrings.
 
     Raises:
-        TypeError, ValueError: a value is not what its field's declaration allows. A default, such as None, always is.
+        TypeError, ValueError: the declaration of a field does not allow its value. Defaults, such as None, are allowed.
     """
 
     def __init_subclass__(cls) -> None:

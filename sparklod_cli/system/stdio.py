@@ -1,4 +1,4 @@
-"""Standard input as a seekable file, and standard output whose failed writes have errors of their own."""
+"""Standard input as a seekable file, and standard output with errors of its own for failed writes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class ReaderGoneError(StdoutError):
 
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
-    """Have failed writes to standard output inside raise `StdoutError` or `ReaderGoneError`."""
+    """Make failed writes to standard output inside raise `StdoutError` or `ReaderGoneError`."""
     before = sys.stdout
     sys.stdout = _GuardedStream(before)
     try:
@@ -29,7 +29,7 @@ def guarded() -> Iterator[None]:
 
 
 def silence(stream: Any) -> None:
-    """Redirect a broken stream to the null device, since the interpreter flushes it at exit, which would fail."""
+    """Redirect a broken stream to the null device; otherwise its flush when the interpreter exits would fail."""
     with contextlib.suppress(OSError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())
@@ -37,7 +37,7 @@ def silence(stream: Any) -> None:
 
 
 class _GuardedStream:
-    """A stream or its buffer; None if it is closed."""
+    """Standard output or its buffer; the stream is None if it is closed."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -56,7 +56,7 @@ class _GuardedStream:
         if self._stream is None:
             raise StdoutError("standard output is closed")
         if data == "":
-            return 0  # click probes streams this way, and ignores errors
+            return 0  # click tries streams this way, and ignores errors
         if isinstance(data, str):
             data = data.encode(self.encoding, self.errors).decode(self.encoding)
         return self._checked(self._stream.write, data)
@@ -75,7 +75,7 @@ class _GuardedStream:
 
 
 def reserve() -> None:
-    """Open closed standard streams, so that no other file gets their descriptors, and with them what libraries print.
+    """Open the descriptors of closed standard streams, so that no other file gets them, and the output of libraries.
 
     In Python they remain closed, as they were at startup.
     """
@@ -96,7 +96,7 @@ def name_of(path: object) -> str:
 
 
 def spooled() -> BinaryIO:
-    """Return standard input as a temporary file, not to be closed; `UnreadableError` if it is closed or a terminal."""
+    """Return standard input as a temporary file that must stay open; raise `UnreadableError` if there is no input."""
     if sys.stdin is None:
         raise UnreadableError("standard input is closed")
     if sys.stdin.isatty():
@@ -117,9 +117,9 @@ def _copy_of(stream: Any) -> BinaryIO:
 
 
 def write_stdout(pieces: Iterable[bytes], *, may_end: bool = False) -> int:
-    """Write to standard output and return the number of bytes; raise `StdoutError` if they cannot be written.
+    """Write to standard output and return the number of bytes; raise `StdoutError` if a write fails.
 
-    If it `may_end`, a reader that closes it after the first lines, as head does, raises `ReaderGoneError` instead.
+    With `may_end`, a reader that closes it early, as head does, raises `ReaderGoneError` instead.
     """
     size = 0
     with guarded():

@@ -1,11 +1,11 @@
-"""Parses bandwidths, times, sizes and counts with units, and formats counts for messages."""
+"""Parse bandwidths, times, sizes and counts with units; format numbers for messages."""
 
 from __future__ import annotations
 
 import math
 import re
 
-#: Prefixes in lower case, as either case is understood: m cannot sensibly mean a thousandth of a bit.
+#: Factors of prefixes, whose case does not matter: m cannot mean a thousandth of a bit.
 PREFIXES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 PREFIXES |= {"ki": 1 << 10, "mi": 1 << 20, "gi": 1 << 30, "ti": 1 << 40}
 
@@ -16,23 +16,23 @@ SIZE = rf"{NUMBER}{PREFIX}(?i:B|bytes?)?"
 TIME = rf"{NUMBER}(?P<unit>ms|s)"
 BANDWIDTH = rf"{NUMBER}{PREFIX}(?P<unit>(?i:bits?|bytes?)|b|B)(?:/s|ps)?"
 
-#: Digits in groups of three: by country, one of the signs between them separates the decimals instead.
+#: Digits in groups of three, whose separator means a decimal point in other countries.
 GROUPED = re.compile(r"[0-9]{1,3}(?:([.,'_ \u00a0\u2019\u202f])[0-9]{3})(?:\1[0-9]{3})*")
 
 
 def count_of(count: int, noun: str, plural: str | None = None) -> str:
-    """Return a text such as "1 node", "1,234 nodes", or "2 leaves" with a plural of its own."""
+    """Return a count with its noun: "1 node", "1,234 nodes", or "2 leaves" with this plural."""
     return f"{count:,} {noun if count == 1 else plural or noun + 's'}"
 
 
 def percent_of(share: float, digits: int = 3) -> str:
-    """Return a share as a percentage, "12.3 %", without an exponent; `digits` are significant."""
+    """Return a share as a percentage with this many significant digits and no exponent: "12.3 %"."""
     text = f"{float(f'{100 * share:.{digits}g}'):,.9f}"
     return f"{text.rstrip('0').rstrip('.')} %"
 
 
 def format_size(size: float) -> str:
-    """Return a number of bytes as "12.3 GB", "2.9 MB", "0.1 MB" or "2.0 kB", of powers of 1000."""
+    """Return a number of bytes in units of powers of 1000: "12.3 GB", "2.9 MB", "0.1 MB" or "2.0 kB"."""
     for name, power, least in (("GB", 1e9, 1e9), ("MB", 1e6, 1e5)):
         if size >= least:
             return f"{size / power:,.1f} {name}"
@@ -40,7 +40,7 @@ def format_size(size: float) -> str:
 
 
 def megabytes(size: float) -> str:
-    """Return a number of bytes, rounded up, in the form that --memory takes: "224MB"."""
+    """Return a number of bytes, rounded up, as a value for --memory: "224MB"."""
     return f"{math.ceil(size / 1e6)}MB"
 
 
@@ -55,8 +55,8 @@ def format_duration(seconds: float) -> str:
 def parse_bandwidth(text: str) -> float:
     """Parse a bandwidth such as 20Mbit, 20Mbit/s, 20Mbps (bits) or 2.5MB/s, 2.5MBps, 2.5Mbyte (bytes) to bytes/s.
 
-    As a letter, b is a bit and B a byte; words may have either case. k, M, G and T are powers of 1000, or of 1024 with
-    an i. Other texts, and a bandwidth of 0, raise `ValueError`.
+    The letter b is a bit and B a byte; the case of words does not matter. k, M, G and T are powers of 1000, or of 1024
+    with an i. Other texts, and a bandwidth of 0, raise `ValueError`.
     """
     match = re.fullmatch(BANDWIDTH, text.strip())
     if match is None:

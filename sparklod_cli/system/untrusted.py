@@ -1,6 +1,6 @@
 """Untrusted text: bounded JSON, typed access to JSON, and text that is safe for terminals and CI logs.
 
-Imports nothing heavy: `--help` needs the table of formats, some of which are recognized by keys.
+Imports nothing heavy: `--help` needs the table of formats, which recognizes some of them by keys.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 #: Maximum nesting depth, so that code can recurse through values; real files have a few levels.
 MAX_DEPTH = 64
 
-#: Maximum number of digits of a 64-bit integer; longer ones become floats, as in most JSON readers.
+#: Maximum number of digits of an integer; longer ones become floats, as in most JSON readers.
 MAX_DIGITS = 19
 
 #: Replaces larger integers; no meaningful number is this large.
@@ -34,10 +34,10 @@ QUOTED = 100
 _SURROGATE = re.compile("[\ud800-\udfff]")
 _ESCAPED_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
-#: Decodes a value at a time; `float` takes any number of digits in time proportional to it.
+#: Decoder of single values; `float` takes time proportional to the number of digits, `int` its square.
 _DECODER = json.JSONDecoder(parse_int=float)
 
-#: A sign of the syntax, with the blanks around it.
+#: Punctuation mark of JSON, with the blanks around it.
 _MARK = re.compile(r"[ \t\r\n]*([{,:])[ \t\r\n]*")
 
 T = TypeVar("T")
@@ -53,10 +53,10 @@ def parse_json(data: str | bytes, *, keep_surrogates: bool = False, depth: int =
         data: the text, or its bytes, see `decoded_text`.
         keep_surrogates: keep lone surrogates, with which Python represents file names that are not UTF-8; otherwise
             they become U+FFFD, so that all texts can be printed and written.
-        depth: most nesting; Python's own parser manages some hundreds.
+        depth: deepest nesting; Python's own parser manages some hundreds.
 
     Raises:
-        ValueError: the text is not JSON, or too deeply nested; the message is one line.
+        ValueError: the text is not JSON or too deeply nested; the message is one line.
     """
     try:
         text = data.removeprefix("\ufeff") if isinstance(data, str) else decoded_text(data)
@@ -74,8 +74,8 @@ def _whole(digits: str) -> int | float:
 
 
 def _checked(root: Any, depth: int, *, replace_surrogates: bool) -> Any:
-    """Check a value level by level, since recursion would fail on the nesting that it guards against."""
-    whole = [root]  # so that every value is an item of a container
+    """Check a value level by level, as recursion would fail on the nesting that this function refuses."""
+    whole = [root]  # so that a container holds every value
     containers: list[Any] = [whole]
     for _ in range(depth + 1):
         inner: list[Any] = []
@@ -98,17 +98,17 @@ def _checked(root: Any, depth: int, *, replace_surrogates: bool) -> Any:
 
 
 def well_formed(text: str) -> str:
-    """Return a text with U+FFFD in place of lone surrogates, which cannot be encoded."""
+    """Replace lone surrogates, which cannot be encoded, by U+FFFD."""
     return _SURROGATE.sub("\ufffd", text)
 
 
 def quoted_value(value: Any) -> str:
-    """Return a value, nested at any depth, as errors quote it: shortened, on one line."""
+    """Format a value of any depth for an error: shortened, on one line."""
     return printable(reprlib.repr(value), QUOTED)
 
 
 def quoted(error: Exception) -> str:
-    """Return the message of a library's error, shortened: it may itself quote much of a file."""
+    """Return the message of a library's error, shortened, as it may quote much of a file."""
     return printable(str(error), 2 * QUOTED)
 
 
@@ -119,9 +119,9 @@ def decoded_text(data: bytes, errors: str = "strict") -> str:
 
 
 def keys_of_object(beginning: bytes) -> list[str]:
-    """Return the keys in the beginning of a JSON object; none for other data."""
+    """Return the complete keys in the beginning of a JSON object; none for other data."""
     text, keys, at, sign = decoded_text(beginning, "replace"), list[str](), 0, "{"
-    with contextlib.suppress(ValueError, RecursionError):  # the beginning ends there, or it is not JSON
+    with contextlib.suppress(ValueError, RecursionError):  # the beginning ends here, or it is not JSON
         while (mark := _MARK.match(text, at)) and mark[1] == sign:
             key, at = _DECODER.raw_decode(text, mark.end())
             colon = _MARK.match(text, at)
@@ -141,9 +141,9 @@ class Origin(NamedTuple):
 
 
 class Json:
-    """A value of an untrusted JSON file and its place there: `lods[3].file of lod-meta.json: expected a text, not 5`.
+    """Value of an untrusted JSON file, with its place for errors: `lods[3].file of meta.json: expected a text, not 5`.
 
-    The arguments `way` are keys and indices that lead from here to a value. Null values count as missing, as in
+    The arguments `way` are keys and indices that lead from this value to an inner one. Null counts as missing, as in
     viewers. Methods raise the error of the file if a value, or one on the way to it, is of another kind.
     """
 
@@ -164,7 +164,7 @@ class Json:
 
     @property
     def place(self) -> str:
-        """Keys and indices that lead to the value from the top of the file; empty at the top."""
+        """Keys and indices from the top of the file to the value; empty at the top."""
         words, here = list[str](), self
         while isinstance(here._above, Json):
             words.append(f"[{here._key}]" if isinstance(here._key, int) else f".{printable(here._key, QUOTED)}")
@@ -172,7 +172,7 @@ class Json:
         return "".join(reversed(words)).removeprefix(".")
 
     def error(self, problem: str) -> Exception:
-        """Return an error about this value, which begins with its place."""
+        """Return an error that begins with the place of this value."""
         top: Json | Origin = self
         while isinstance(top, Json):
             top = top._above
@@ -180,7 +180,7 @@ class Json:
         return top.error(f"{subject}: {problem}" if subject else problem)
 
     def unexpected(self, kind: str) -> Exception:
-        """Return the error for a value that is missing or not of a kind."""
+        """Return the error for a value that is missing or not of the expected kind."""
         found = "but it is missing" if self.value is None else f"not {quoted_value(self.value)}"
         return self.error(f"expected {kind}, {found}")
 
@@ -200,7 +200,7 @@ class Json:
         return here
 
     def _at(self, way: tuple[str | int, ...]) -> Any:
-        if len(way) == 1 and isinstance(self.value, dict):  # half a million times in a large manifest
+        if len(way) == 1 and isinstance(self.value, dict):  # called half a million times for a large manifest
             return self.value.get(way[0])
         return self.get(*way).value
 
@@ -214,7 +214,7 @@ class Json:
     def optional(self, key: str, read: Callable[[Self], T], default: T) -> T: ...
 
     def optional(self, key: str, read: Callable[[Self], T], default: T | None = None) -> T | None:
-        """Return the result of a method for a key; the default if the key is missing."""
+        """Return what a method reads from the value of a key; the default if the key is missing."""
         found = self.get(key)
         return default if found.value is None else read(found)
 
@@ -248,13 +248,13 @@ class Json:
         return float(value) if type(value) in (int, float) else None
 
     def numbers(self, *counts: int, most: float = LARGEST) -> list[float]:
-        """Return a list of numbers, of one of these lengths; without lengths, of any."""
+        """Return a list of numbers that has one of these lengths, or any length without arguments."""
         if not isinstance(self.value, list) or (counts and len(self.value) not in counts):
             raise self.unexpected(f"a list of {''.join(f'{count} or ' for count in counts)[:-3]}numbers")
         return [item.number(most=most) for item in self.items()]
 
     def matrix(self, *rows: int, columns: int = 4, most: float = LARGEST) -> list[float]:
-        """Return the numbers of a matrix of one of these numbers of rows, from a list of rows or of numbers."""
+        """Return the numbers of a matrix with one of these row counts, given as a list of rows or of numbers."""
         value = self.value
         if isinstance(value, list) and len(value) in rows and all(isinstance(row, list) for row in value):
             return [number for row in self.items() for number in row.numbers(columns, most=most)]
@@ -282,28 +282,28 @@ GAP = " ... "
 #: Replaces passwords and signatures in addresses.
 HIDDEN = "***"
 
-#: User and password of an address, up to its host: the password may hold an @ or, if it begins like no port, a slash.
+#: User and password before the host of an address. A password may hold an @, and a slash unless it looks like a port.
 _CREDENTIALS = re.compile(r"(?<=://)[^\s/:@]{0,256}:(?:[^\s/]{0,1024}|(?!:|\d{1,5}/)[^\s@]{0,1024})@")
 
-#: The query of an address of the web, or one of parameters; elsewhere a ? may be in a name.
+#: Query of an address of the web, or one with parameters; in other addresses, a ? may belong to a name.
 _QUERY = re.compile(
     r"((?i:https?)://[^\s?]{0,4096}|://[^\s?]{0,4096}(?=\?\S{0,4096}?=))\?[^\s'\"]{0,8192}[^\s'\",:;.)]"
 )
 
 _SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
-#: Code points with which Python represents bytes of a file name that are not UTF-8.
+#: Code points that represent bytes of file names that are not UTF-8.
 _BYTES = range(0xDC80, 0xDD00)
 
 
 def printable(text: str, most: int | None = None) -> str:
-    """Return a text on one line that cannot control a terminal or a log.
+    """Return a text as one line that cannot control a terminal or a log.
 
     Unprintable characters are escaped as in Python strings: control characters, line ends, directional marks and lone
     surrogates; so is the start of a GitHub Actions command. Secrets in addresses are hidden, see `redacted`.
 
     Args:
-        most: maximum length. A longer text loses its middle, since it may begin with a path and end with a reason.
+        most: maximum length. A longer text loses its middle, as it may begin with a path and end with a reason.
     """
     text = shortened(redacted(text), most)
     if not text.isprintable():
@@ -315,12 +315,12 @@ def printable(text: str, most: int | None = None) -> str:
 
 
 def redacted(text: str) -> str:
-    """Return a text whose addresses have no passwords, and no queries, which may be signatures."""
+    """Hide the passwords, and the queries, which may be signatures, of all addresses in a text."""
     return _QUERY.sub(rf"\1?{HIDDEN}", _CREDENTIALS.sub(f"{HIDDEN}@", text)) if "://" in text else text
 
 
 def without_secrets(text: str, url: str) -> str:
-    """Return a text without the passwords and queries of an address, even where it quotes them alone."""
+    """Hide the passwords and queries of an address in a text, even where it quotes them alone."""
     credentials = [match[0][:-1] for match in _CREDENTIALS.finditer(url)]
     queries = [match[0][len(match[1]) + 1 :] for match in _QUERY.finditer(url)]
     secrets = (*credentials, *(each.partition(":")[2] for each in credentials), *queries)
@@ -330,7 +330,7 @@ def without_secrets(text: str, url: str) -> str:
 
 
 def shortened(text: str, most: int | None) -> str:
-    """Return a text of at most `most` characters: the beginning and the end of a longer one."""
+    """Shorten a text to at most `most` characters of its beginning and its end."""
     if most is None or len(text) <= most:
         return text
     end = (most - len(GAP)) // 4
@@ -351,9 +351,9 @@ def near(name: str, known: Iterable[str], *, cutoff: float = 0.6, folder: Path |
 
     Args:
         cutoff: least similarity, 0 to 1, see `difflib`.
-        folder: of the names, if they are files.
+        folder: printed before the names, if these are files.
     """
-    import difflib  # takes a millisecond to load, and is needed after a mistake only
+    import difflib  # takes a millisecond to load, and is needed only after a mistake
 
     found = difflib.get_close_matches(name, list(known), n=3, cutoff=cutoff)
     return f", did you mean {' or '.join(str(folder / each) if folder else each for each in found)}?" if found else ""
