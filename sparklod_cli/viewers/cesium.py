@@ -1,8 +1,8 @@
 """CesiumJS: the tiles of 3D Tiles that it draws for a camera, also while tiles load.
 
-A tile is refined where its geometric error, as many pixels on the screen, is more than `PIXEL_ERROR`, and none of its
-children is missing; tiles outside the picture are neither drawn nor refined. That is what CesiumJS 1.145 does by
-default (`Cesium3DTile.getScreenSpaceError` and `Cesium3DTilesetBaseTraversal`), but for `dynamicScreenSpaceError`,
+A tile is refined if its geometric error covers more than `PIXEL_ERROR` pixels on the screen, and none of its
+children is missing; tiles outside the picture are neither drawn nor refined. CesiumJS 1.145 does so by
+default (`Cesium3DTile.getScreenSpaceError` and `Cesium3DTilesetBaseTraversal`), except for `dynamicScreenSpaceError`,
 which takes coarser tiles far away in views along the horizon of the Earth.
 """
 
@@ -84,7 +84,7 @@ class TileChoice:
 
 
 class CesiumViewer:
-    """Finds cuts of scenes of tiles; several threads may ask it."""
+    """Finds cuts of scenes of tiles; several threads may use it."""
 
     def __init__(self, forest: Forest, instances: Sequence[TreeInstance]) -> None:
         self.forest, self.instances = forest, list(instances)

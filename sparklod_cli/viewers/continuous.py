@@ -140,7 +140,7 @@ def find_threshold(limit: NDArray[np.float32], more: NDArray[np.int64], room: in
 
 
 def _first_over(limit: NDArray[np.float32], more: NDArray[np.int64], room: int) -> float:
-    """Return the limit of the first node that adds too much, refined by descending limits; 0 if none does."""
+    """Return the limit at which nodes refined by descending limits exceed the room; 0 if they never do."""
     # Only nodes that have the upper half of its bits are sorted; the bits of floats >= 0 are in their order.
     upper = limit.view(np.int32) >> BUCKET_BITS
     totals = np.cumsum(np.bincount(upper, weights=more, minlength=BUCKETS)[::-1])
@@ -176,7 +176,7 @@ class _Inner:
         return limit
 
     def blended(self, share: Shares) -> tuple[NDArray[np.uint32], Shares]:
-        """Return the nodes with a weight above 0, ascending, and their weights, for (M,) shares of `shares`."""
+        """Return the nodes with a weight above 0, ascending, and their weights; `share` is (M,), see `shares`."""
         refined = np.zeros(len(self._nodes))
         refined[self._node] = share
         weight = refined[self._parent] - refined

@@ -1,4 +1,4 @@
-"""The protocol of viewers, `Viewer`; the scenes that they hold, shared by instances; and the cuts that they draw."""
+"""The protocol of viewers, `Viewer`; the scenes that they load, shared by instances; and their cuts."""
 
 from __future__ import annotations
 
@@ -12,28 +12,27 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.camera import Camera
 from ..codecs.formats import PRECISIONS
 from ..lod.kernels import pixel_scale
 from ..model.foveation import Cones, Foveation
 from ..model.gaussian import spark_size
 from ..model.lod_tree import CHUNK_NODES, LodTree
-from ..model.scene import Scene
+from ..model.scene import FileCoding, Scene
 from ..model.splats import COLUMNS, Splats
 from .viewer_settings import FETCHERS
 
 if TYPE_CHECKING:
-    from ..cameras.camera import Camera
     from ..codecs.spark_nodes import Nodes
-    from ..model.scene import FileCoding
 
 Matrix = NDArray[np.float64]
 
 
 class Viewer(Protocol):
-    """A viewer of instances of some scenes; several threads may ask it.
+    """A viewer of instances of scenes; several threads may use it.
 
-    A fourth one is a module with two classes, this one and a `LoadedScene` with the chunks of a scene, and
-    a row in `Scenes.viewer`.
+    A fourth one is a module with two classes, a `Viewer` and a `LoadedScene` with the chunks of a scene, and
+    a branch in `Scenes.viewer`.
     """
 
     forest: Forest
@@ -42,7 +41,7 @@ class Viewer(Protocol):
     def cut(
         self, camera: Camera, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
     ) -> TreeCut:
-        """Return the cut that it draws; `TreeCut.wanted` lists the chunks that it asks for.
+        """Return the cut that it draws; `TreeCut.wanted` lists the chunks that it requests.
 
         Args:
             budget: maximum number of splats, all instances together; at least one per instance.
@@ -55,8 +54,8 @@ class Forest:
     """Scenes in the memory layout of cuts, one after the other.
 
     Args:
-        scenes: each a `LoadedScene`, or `Nodes`: with numbers of splats (`count`) and of `chunks`, and the `depth` of
-            each splat; `fill` sets their `pixel_scale.NODE`.
+        scenes: each a `LoadedScene`, or `Nodes`: both have numbers of splats (`count`) and of `chunks`, the `depth` of
+            each splat, and `fill`, which sets their `pixel_scale.NODE`.
 
     Attributes:
         node_base: (scenes + 1,) int64 index of each scene's first node.
@@ -79,7 +78,7 @@ class Forest:
 
     @functools.cached_property
     def depth(self) -> NDArray[np.int32]:
-        """(N,) edges from the root to each node that was read, or its detail level."""
+        """(N,) edges from the root to each node, or its detail level; 0 for nodes of pages that were not read."""
         depths = [scene.depth for scene in self.scenes]
         return depths[0] if len(depths) == 1 else np.concatenate(depths)
 
@@ -102,15 +101,15 @@ class TreeCut:
         views: (instances,) `pixel_scale.VIEW`.
         node: (S,) uint32 index in its tree.
         instance: (S,) uint16.
-        limit: (S,) float32, the least pixel scale from the root to the node; negative if the queue took it out, because
-            it has no children or they are not resident.
+        limit: (S,) float32, the least pixel scale from the root to the node; negative if the node cannot be refined,
+            because it has no children or they are not resident.
         reason: why the cut is not finer, see `Cut.reason`.
         missing: number of nodes that would be refined if their children were resident, and of roots that are not.
         least: the least limit of a refined node; infinite if none was refined.
         stop: (pixel scale, instance, index) of the node that would have exceeded the budget, or None.
         demand: (chunks,) float32, for each chunk of all trees the largest limit of the nodes that are, or should be,
             refined and have children in it; 0 without such nodes.
-        seconds: that it took to find, once its chunks were in memory.
+        seconds: duration of the search, once its chunks were in memory.
     """
 
     views: NDArray[np.void]
@@ -132,9 +131,9 @@ class TreeCut:
         return [np.sort(self.node[self.instance == number]) for number in range(len(self.views))]
 
     def wanted(self) -> list[int]:
-        """Return the chunks of all trees that finding the cut reads, or would read if they were resident, by priority.
+        """Return the chunks of all trees that the search reads, or would read if they were resident, by priority.
 
-        Those of equal priority are in the order of their numbers; Spark has them in the order that its queue finds.
+        Chunks of equal priority are in the order of their numbers; Spark orders them as its queue finds them.
         """
         requested = np.flatnonzero(self.demand > 0)
         order: list[int] = requested[np.argsort(-self.demand[requested], kind="stable")].tolist()
@@ -161,10 +160,10 @@ def views_of(forest: Forest, instances: Sequence[TreeInstance], view: Camera) ->
 
 Index = NDArray[np.signedinteger]
 
-#: What a scene without a file is called in messages and titles.
+#: Name of a scene without a file, in messages and titles.
 UNNAMED = "scene"
 
-#: What viewers draw cuts of.
+#: Kinds of scenes that viewers draw cuts of.
 TREE, STREAMED_SOG, TILES = "a Level-of-Detail tree", "Streamed SOG", "3D Tiles"
 
 #: Columns that nodes are made of.
@@ -179,11 +178,11 @@ class LoadedScene:
         file: None for a scene that was in memory.
         bytes: of the file; of a scene that was in memory, of its columns.
         scene: as the file has it; columns that were not read are 0.
-        splats: N, as they are drawn: those of the scene, or what a coding makes of them.
-        first_chunk: number of its first chunk, where the chunks of all scenes are counted.
+        splats: N, as they are drawn: those of the scene, or as a coding rounds them.
+        first_chunk: number of its first chunk among the chunks of all scenes.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
         threads: to prepare nodes on.
-        kind: of scene that cuts are drawn of, `TREE`, `STREAMED_SOG` or `TILES`; None for a plain scene.
+        kind: `TREE`, `STREAMED_SOG` or `TILES`; None for a plain scene, which has no cuts.
         count: number of splats.
         chunks: number of chunks, of 65,536 splats each, or of files.
         has_chunks: its format has chunks of as many splats as Spark streams (RAD).
@@ -220,7 +219,7 @@ class LoadedScene:
         self.has_chunks = sizes is not None and len(sizes) == self.chunks and splats == CHUNK_NODES
 
     def fill(self, rows: NDArray[np.void]) -> None:
-        """Fill (N,) `NODE`: nodes of a tree; of other scenes splats, with a child where finer ones replace them."""
+        """Fill (N,) `NODE` with the nodes of a tree, or with splats; all but those of full detail have a child."""
         scene = self.scene
         if scene.tree is not None:
             nodes_of(scene.splats, scene.tree, scene.coding, precision=self.precision, threads=self.threads).fill(rows)
@@ -255,14 +254,14 @@ class LoadedScene:
         return self.splats if len(index) == self.count else self.splats.take(index)
 
     def chunk_of(self, index: Index) -> NDArray[np.int64]:
-        """Return the (M,) numbers of the chunks that some splats are in, where the chunks of all scenes are counted."""
+        """Return the (M,) numbers of the chunks of splats, among the chunks of all scenes."""
         return self.first_chunk + index // CHUNK_NODES
 
     @property
     def requests(self) -> Sequence[tuple[int, ...]]:
         """For each chunk, bytes of the answer to its first request, and to the others, which are sent together.
 
-        Without chunks of its own (SPZ) they are as if the file were cut evenly.
+        A file without chunks (SPZ) counts as cut evenly.
         """
         if self.scene.chunk_bytes is not None and self.has_chunks:
             return [(size,) for size in self.scene.chunk_bytes]
@@ -285,7 +284,7 @@ def cut_of_runs(
     demand: NDArray[np.float32],
     start: float,
 ) -> TreeCut:
-    """Return the cut of these splats of each instance, which `time.perf_counter` timed from `start` on."""
+    """Return the cut of these splats of each instance; `start` is the `time.perf_counter` before the search."""
     return TreeCut(
         views=views_of(forest, instances, view),
         node=np.concatenate(nodes),
@@ -300,18 +299,14 @@ def cut_of_runs(
     )
 
 
-#: How many bytes Spark's pager asks for at first, then if they do not hold the whole header of a file.
+#: Bytes of the beginning of a file that Spark's pager requests: the next number while the header is not whole.
 HEADER_REQUESTS = (64 << 10, 256 << 10, 1 << 20)
 
 
 def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
-    """Return the sizes of the answers that Spark's pager waits for before it can ask for a chunk of a file.
+    """Return the sizes of the answers with a header, which Spark's pager requests before any chunk of a file.
 
-    It does not know how long the header is, so it asks for the beginning of the file, and for more of it as long as the
-    header is not whole. What it gets of the first chunk along with it is thrown away.
-
-    Args:
-        header_bytes: of the header; 0 where the format has none that a viewer would need.
+    It discards the part of the first chunk in them. A format without a header has 0 `header_bytes`, and no answers.
     """
     answers: list[int] = []
     for request in HEADER_REQUESTS:
@@ -321,7 +316,7 @@ def header_answers(header_bytes: int, file_bytes: int) -> tuple[int, ...]:
 
 
 def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding | None, *, precision: str, threads: int) -> Nodes:
-    """Return nodes as a traversal reads them, in one of `codecs.formats.PRECISIONS`."""
+    """Return the nodes of a tree for a traversal, in one of `codecs.formats.PRECISIONS`."""
     from ..codecs import spark_nodes
 
     if precision == "float32":
@@ -334,5 +329,5 @@ def nodes_of(splats: Splats, tree: LodTree, coding: FileCoding | None, *, precis
 
 
 def bytes_of(splats: Splats) -> int:
-    """Return the bytes of the columns."""
+    """Return the bytes of all columns in memory."""
     return sum(getattr(splats, name).nbytes for name in COLUMNS)

@@ -36,18 +36,18 @@ KEPT_SHARE, LEAST_KEPT = 0.25, 8
 
 
 class Pages:
-    """The nodes and splats of a RAD file that were needed so far.
+    """Nodes and splats of a RAD file that is read chunk by chunk.
 
-    Nodes of chunks that were read stay in memory, 28 bytes each; of decoded splats, only those of some chunks. Several
-    threads may use it. Where a chunk is damaged, a `FormatError` names the file.
+    Nodes of all chunks that were read stay in memory, 28 bytes each; decoded splats only of the last ones. Several
+    threads may use it. A `FormatError` about a damaged chunk names the file.
 
     Args:
         reader: of a tree in chunks of `CHUNK_NODES`; its file may be closed.
         threads: to decode splats with.
 
     Attributes:
-        present: (chunks,) bool, those whose nodes are in memory.
-        depth: (N,) int32 edges from the root, of the nodes that the present chunks lead to; 0 of others.
+        present: (chunks,) bool, chunks whose nodes are in memory.
+        depth: (N,) int32 edges from the root to nodes of present chunks and to their children; 0 for others.
     """
 
     def __init__(self, path: Path, reader: RadReader, nodes_of: NodesOf, threads: int) -> None:
@@ -64,14 +64,17 @@ class Pages:
             self._kept = max(LEAST_KEPT, int(KEPT_SHARE * free / size))
 
     def place(self, nodes: NDArray[np.void], depth: NDArray[np.int32]) -> None:
-        """Set the arrays of zeros, (N,) `NODE` and (N,) int32, that nodes are read into, and read the root; once."""
+        """Set the arrays of zeros, (N,) `NODE` and (N,) int32, that nodes are read into, and read the first chunk.
+
+        Only the first call has an effect.
+        """
         if self.present.any():
             return
         self.nodes, self.depth = nodes, depth
         self.read([0])
 
     def read(self, numbers: Sequence[int]) -> None:
-        """Read the nodes of chunks that are not present; a `TreeError` if their children are not those of a tree."""
+        """Read the nodes of chunks that are not present; raise a `TreeError` if they break the tree."""
         for number in numbers:
             with self._lock:
                 if self.present[number]:
@@ -86,7 +89,7 @@ class Pages:
                 self._descend(known if number else np.concatenate([np.zeros(1, np.int64), known]))
 
     def _check(self, tree: LodTree, start: int) -> None:
-        """Raise a `TreeError` for children that no tree has; `LodTree.validate` has the same texts."""
+        """Raise a `TreeError` for children that come too early or past the end, with texts of `LodTree.validate`."""
         first, node = tree.child_start.astype(np.int64), start + np.arange(len(tree))
         for mask, what in (
             (~tree.is_leaf & (first <= node), "comes after one of its children"),
@@ -96,7 +99,7 @@ class Pages:
                 raise TreeError(f"{self._path}: its tree is broken: node {node[np.argmax(mask)]} {what}")
 
     def _descend(self, frontier: NDArray[np.int64]) -> None:
-        """Set the depths of the nodes below some whose depth is known, in the chunks that are present."""
+        """Set the depths of all nodes below those of the frontier, whose depths are known, in present chunks."""
         while len(frontier):
             count = self.nodes["child_count"][frontier].astype(np.int64)
             inner, count = frontier[count > 0], count[count > 0]
@@ -110,7 +113,7 @@ class Pages:
             frontier = children[self.present[children >> CHUNK_BITS]]
 
     def splats(self, index: NDArray[np.integer]) -> Splats:
-        """Return some splats by their indices, (M,) ascending; decoded chunks are cached for the next ones."""
+        """Return splats by their indices, (M,) ascending; decoded chunks are cached for the next call."""
         rows = Splats.empty(len(index), self.rad.header.max_sh)
         numbers, begins = np.unique(index >> CHUNK_BITS, return_index=True)
         ends = itertools.pairwise([*begins.tolist(), len(index)])
@@ -138,7 +141,7 @@ class Pages:
         return rows
 
     def blocks(self, columns: Collection[str]) -> Iterator[tuple[Splats, LodTree]]:
-        """Yield all chunks in order, with these columns; none of them is cached."""
+        """Yield all chunks in order, without caching them."""
         with naming(self._path), reopened(self._path, self.rad) as reader:
             for _, splats, tree in reader.chunks(columns, thorough=False, threads=self._threads):
                 assert tree is not None
@@ -167,12 +170,12 @@ class PagedScene(LoadedScene):
 
     @property
     def depth(self) -> NDArray[np.int32]:
-        """(N,) edges from the root to each node that was read, and to their children."""
+        """(N,) edges from the root to nodes of present chunks and to their children; 0 for others."""
         return self.pages.depth
 
     @functools.cached_property
     def leaves(self) -> Index:
-        """(M,) indices of full detail, for which the children of all nodes are read."""
+        """(M,) indices of full detail, found by reading the whole tree."""
         found = [np.flatnonzero(tree.is_leaf) for _, tree in self.pages.blocks(())]
         return np.concatenate([number * CHUNK_NODES + leaves for number, leaves in enumerate(found)])
 
@@ -185,7 +188,7 @@ class PagedScene(LoadedScene):
 
 
 def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) -> Balls:
-    """Return the sample of what the splats of instances cover that cameras are framed by."""
+    """Return a sample of the bounding spheres of all splats of instances, for framing cameras."""
     counts = [loaded.leaf_count for loaded in scenes]
     while True:
         every = max(sum(counts) // SAMPLE, 1)
@@ -205,7 +208,7 @@ def sampled_balls(instances: Sequence[Instance], scenes: Sequence[LoadedScene]) 
                 high = np.maximum(high, balls.center.max(axis=0, initial=-np.inf))
         if found == counts:
             break
-        counts = found  # some are not finite, and do not count
+        counts = found  # without those that are not finite
     whole = Balls.concat([Balls(np.empty((0, 3)), np.empty(0)), *itertools.chain.from_iterable(parts)])
     return Balls(whole.center, whole.radius, np.stack([low, high]), largest)
 

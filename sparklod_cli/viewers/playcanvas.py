@@ -1,7 +1,7 @@
 """PlayCanvas: the detail levels of Streamed SOG that it draws for a camera, also while chunk files load.
 
-A region is drawn at the level that is chosen for it as soon as the file of that level is there, and until then as it
-was. PlayCanvas 2.23 does so in `GSplatOctreeInstance.applyLodChanges`; priorities are those of its `requestFile`.
+A region is drawn at its chosen level as soon as the file of that level is loaded, and until then at its previous level.
+PlayCanvas 2.23 does so in `GSplatOctreeInstance.applyLodChanges`; priorities are those of its `requestFile`.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Chains:
 
 @dataclass(frozen=True, eq=False)
 class Distant:
-    """An instance as a camera sees it, with (R,) `RegionBounds.squared_distances` and its own base distance."""
+    """An instance as a camera sees it: (R,) `RegionBounds.squared_distances`, and its base distance in world units."""
 
     chains: Chains
     squared_distance: Distances
@@ -105,8 +105,8 @@ class DetailChoice:
     Attributes:
         levels: for each instance (R,) the level of each region; -1 for a region without splats. A level at which a
             region has no splats shows nothing of it.
-        splats: how many they are, all together; more than the budget only where the coarsest levels are.
-        reason: why no level is finer: "budget", "distance" (none is due to be) or "exhausted" (all are the finest).
+        splats: number of splats at these levels; more than the budget only if the coarsest levels have more.
+        reason: why no level is finer: "budget", "distance" (finer ones begin nearer) or "exhausted" (all are finest).
     """
 
     levels: tuple[Levels, ...]
@@ -115,7 +115,7 @@ class DetailChoice:
 
 
 def choose(instances: Sequence[Distant], budget: int, rule: DetailRule) -> DetailChoice:
-    """Return the levels that a viewer shows of one or more instances, within a budget of splats of all together."""
+    """Return the levels that a viewer shows of one or more instances, all within one budget of splats."""
     limit = rule.mode == "limit"
     coarsest = sum(int(each.chains.count[:, -1].sum()) for each in instances)
     finest = sum(int(each.chains.count[:, 0].sum()) for each in instances)
@@ -145,7 +145,7 @@ def _keys(instance: Distant, rule: DetailRule) -> Levels:
 
 
 def _threshold(instances: Sequence[Distant], keys: Sequence[Levels], room: int, bins: int) -> int:
-    """Return the least key of a step that is taken: the highest at which the budget suffices, to a part.
+    """Return the least key of the steps to coarser levels that are taken, so that the budget suffices.
 
     All regions together may exceed their coarsest levels by `room` splats; `bins` is the highest bin.
     """
@@ -160,7 +160,7 @@ def _threshold(instances: Sequence[Distant], keys: Sequence[Levels], room: int, 
 
 
 def _first_over(number: Levels, saved: Levels, room: int, count: int) -> tuple[int, int]:
-    """Return the first bin whose splats, with those of all before it, exceed the room; and the room before it."""
+    """Return the first bin at which the sum of saved splats exceeds the room; and the room left before it."""
     added = np.cumsum(np.bincount(number, saved, minlength=count)[:count])
     over = np.flatnonzero(added > room)
     first = int(over[0]) if len(over) else count
@@ -177,7 +177,7 @@ def _chosen(instances: Sequence[Distant], places: Sequence[Levels], reason: str)
 
 
 class RegionBounds:
-    """Bounds of regions as PlayCanvas holds them: in float32, each with what it has more than the median.
+    """Bounds of regions as PlayCanvas holds them: in float32, each with its excess over the median size.
 
     Args:
         bounds: (R, 2, 3) lowest and highest corner of each, in the space of the scene.
@@ -199,7 +199,7 @@ class RegionBounds:
         """Return (R,) squared distances by which levels are chosen, world units at a field of view of 45 degrees.
 
         The distance is that from the camera to the nearest point of the bound, shrunk by `rule.shrink` of its excess;
-        what lies behind the camera counts as farther. As `GSplatOctreeInstance.evaluateNodeDistances` of PlayCanvas.
+        bounds behind the camera count as farther. As `GSplatOctreeInstance.evaluateNodeDistances` of PlayCanvas.
 
         Args:
             object_to_world: (4, 4) where the scene stands: a rotation, a uniform scale and a translation.
@@ -229,18 +229,16 @@ class DetailFiles:
     """Chunk files of a scene at several detail levels.
 
     Attributes:
-        of_run: (R, L) int64 number of the chunk file of each run; -1 where there is no run.
-        sizes: (F,) int64 bytes of the chunk files, then of that of the environment where there is one.
-        requests: for each, bytes of its meta.json, then of each of its images; empty for a scene in memory.
+        of_run: (R, L) int64 number of the chunk file of each region at each level; -1 for none.
+        requests: for each chunk file, and last that of the environment, bytes of its meta.json and of each image.
         environment: number of the chunk file of the environment; None without.
-        manifest: bytes of the manifest, which is read before any other file.
+        manifest: bytes of the manifest, which is read before any other file; 0 for a scene in memory.
     """
 
     of_run: NDArray[np.int64]
-    sizes: NDArray[np.int64]
+    requests: Sequence[tuple[int, ...]]
     environment: int | None = None
     manifest: int = 0
-    requests: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(eq=False)
@@ -255,7 +253,7 @@ class LoadedDetail(LoadedScene):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.kind, self.chunks = STREAMED_SOG, len(self.files.sizes)
+        self.kind, self.chunks = STREAMED_SOG, len(self.files.requests)
 
     @property
     def headers(self) -> tuple[int, ...]:
@@ -264,7 +262,7 @@ class LoadedDetail(LoadedScene):
 
     @property
     def requests(self) -> Sequence[tuple[int, ...]]:
-        return self.files.requests or [(size,) for size in self.files.sizes.tolist()]
+        return self.files.requests
 
     @functools.cached_property
     def depth(self) -> NDArray[np.int32]:
@@ -287,21 +285,21 @@ class LoadedDetail(LoadedScene):
 
 
 def read_detail_files(path: Path) -> DetailFiles:
-    """Return the files of a lod-meta.json, or of the folder that holds it; regions are in the order of the manifest."""
+    """Return the files of a lod-meta.json, or of its folder; regions are in the order of the manifest."""
     with opened(path) as (source, _):
         assert source.open_companion is not None
         data = source.file.read(MAX_MANIFEST + 1)
         manifest = parse(data)
-        requests = tuple(_bytes_of_files(source.open_companion, name) for name in manifest.names())
+        requests = [_bytes_of_files(source.open_companion, name) for name in manifest.names()]
     layout = layout_of(manifest)
     of_run = np.full(layout.counts.shape, -1, np.int64)
     of_run[layout.region, layout.level] = layout.file
     environment = None if manifest.environment is None else len(manifest.filenames)
-    return DetailFiles(of_run, np.array([*map(sum, requests)], np.int64), environment, len(data), requests)
+    return DetailFiles(of_run, requests, environment, len(data))
 
 
 def _bytes_of_files(open_companion: OpenCompanion, name: str) -> tuple[int, ...]:
-    """Return the bytes of the files of a chunk; () where one cannot be read, which reading its splats reports."""
+    """Return the bytes of each file of a chunk; () if one cannot be read, which fails when its splats are read."""
     sizes = list[int]()
     try:
         for each in files_of_chunk(open_companion, name):
@@ -315,18 +313,20 @@ def _bytes_of_files(open_companion: OpenCompanion, name: str) -> tuple[int, ...]
 def files_in_memory(detail: DetailScene) -> DetailFiles:
     """Return files for a scene in memory: one for each level, of the bytes of its columns, and the environment."""
     of_run = np.where(detail.counts > 0, np.arange(detail.levels), -1)
-    sizes = [bytes_of(detail.splats) * int(count) // max(1, len(detail.splats)) for count in detail.counts.sum(axis=0)]
+    counts, size = detail.counts.sum(axis=0).tolist(), bytes_of(detail.splats)
+    requests = [(size * count // max(1, len(detail.splats)),) for count in counts]
     if detail.environment is None:
-        return DetailFiles(of_run, np.array(sizes, np.int64))
-    return DetailFiles(of_run, np.array([*sizes, bytes_of(detail.environment)], np.int64), detail.levels)
+        return DetailFiles(of_run, requests)
+    return DetailFiles(of_run, [*requests, (bytes_of(detail.environment),)], detail.levels)
 
 
 class PlayCanvasViewer:
-    """Finds cuts of scenes at several detail levels; several threads may ask it, unless it remembers.
+    """Finds cuts of scenes at several detail levels; several threads may use it, unless it remembers.
 
     Args:
-        fixed: splats that are drawn besides, and count against the budget.
-        remembers: while files are missing, regions stay as the cut before had them; without, nothing was drawn before.
+        fixed: splats of other scenes, which count against the budget.
+        remembers: cuts are those of successive frames: while files are missing, regions stay as in the last cut;
+            otherwise each cut is that of a first frame.
     """
 
     def __init__(
@@ -347,7 +347,7 @@ class PlayCanvasViewer:
     def cut(
         self, camera: Camera, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
     ) -> TreeCut:
-        """Return the cut that PlayCanvas draws: the splats of the levels of all regions, and the environments.
+        """Return the cut that PlayCanvas draws: all regions at their levels, and the environments.
 
         Environments do not count against the budget, and `smallest` has no effect; see `Viewer.cut`.
         """
@@ -381,7 +381,7 @@ class PlayCanvasViewer:
 
 
 def _splats_of(scene: DetailScene, levels: Levels, *, environment: bool) -> NDArray[np.uint32]:
-    """Return the splats of regions at some levels, ascending, and those of the environment."""
+    """Return indices of the splats of regions at (R,) levels, ascending, and of those of the environment."""
     regions = np.flatnonzero(levels >= 0)
     starts, counts = scene.starts[regions, levels[regions]], scene.counts[regions, levels[regions]]
     order = np.argsort(starts, kind="stable")
@@ -405,7 +405,7 @@ def loading(
 
     Args:
         chosen: (R,) levels, -1 for a region without splats.
-        before: (R,) levels that were drawn before, -1 for none; None for none at all.
+        before: (R,) levels of the previous frame, -1 for regions that it did not draw; None for a first frame.
         underfill: see `DetailRule`.
 
     Returns:
@@ -416,8 +416,8 @@ def loading(
     before = np.full(len(chosen), -1) if before is None else before
     desired = _desired(chains, files, chosen, resident, underfill)
     drawn = np.where(_there(files, desired, resident), desired, before)
-    rank = 1 / (1 + np.maximum(squared_distance, 1e-12))
-    priority = np.zeros(len(files.sizes))
+    rank = 1 / (1 + np.maximum(squared_distance, NEAREST_SQUARED))
+    priority = np.zeros(len(files.requests))
 
     def ask(level: Levels, tier: NDArray[np.int64] | int) -> None:
         file = _file(files, level)
@@ -435,9 +435,9 @@ def loading(
 
 
 def _desired(chains: Chains, files: DetailFiles, chosen: Levels, resident: NDArray[np.bool_], underfill: int) -> Levels:
-    """Return the (R,) chosen level, or while its file is missing one that is at most `underfill` levels coarser.
+    """Return the (R,) chosen levels; while its file is missing, one at most `underfill` levels coarser instead.
 
-    That is the finest whose file is there, and where none is, the coarsest that has a file.
+    That is the finest whose file is resident, or else the coarsest that has a file.
     """
     found, coarsest, level, rows = chosen.copy(), chosen.copy(), chosen.copy(), np.arange(len(chosen))
     open_ = (chosen >= 0) & ~_there(files, chosen, resident)
@@ -456,18 +456,18 @@ def _desired(chains: Chains, files: DetailFiles, chosen: Levels, resident: NDArr
 
 
 def _there(files: DetailFiles, level: Levels, resident: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a (R,) mask of regions that can be drawn at some levels: nothing is missing."""
+    """Return (R,) bool, whether the file of each region at a level is resident, or there is none."""
     file = _file(files, level)
     return (file < 0) | resident[file]
 
 
 def _file(files: DetailFiles, level: Levels) -> NDArray[np.int64]:
-    """Return the (R,) files of regions at some levels; -1 for none."""
+    """Return the (R,) numbers of the files of regions at (R,) levels; -1 for none."""
     return np.where(level >= 0, files.of_run[np.arange(len(level)), level], -1)
 
 
 def _finer(chains: Chains, level: Levels) -> Levels:
-    """Return the (R,) next finer levels of chains; -1 without one."""
+    """Return the (R,) levels of chains that are next finer than (R,) levels; -1 for none."""
     below = (chains.level < level[:, None]) & (chains.level >= 0)
     last = below.shape[1] - 1 - np.argmax(below[:, ::-1], axis=1)
     return np.where(below.any(axis=1), chains.level[np.arange(len(level)), last], -1)

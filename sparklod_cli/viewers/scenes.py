@@ -1,4 +1,4 @@
-"""Scenes of instances, each read once; `Cut`, the splats of them that are drawn, and `CutFinder`, which finds cuts."""
+"""Scenes loaded for viewing, shared by their instances; cuts, the splats of them that a viewer draws."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..codecs.reader import Reader
 from ..io.files import opened, size_of_input
 from ..lod.budget import Budget
 from ..model.gaussian import placed
-from ..model.instances import DetailScene, Instance, Matrix, TileScene
+from ..model.instances import DetailScene, Instance, Matrix, Source, TileScene
 from ..model.lod_tree import CHUNK_NODES, LodTree
 from ..model.scene import Scene, common_axis, facts_of, rotated_axis
 from ..model.selection import Selection, describe
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 Weights = NDArray[np.float64]
 
-#: Kinds of scenes, `LoadedScene.kind`.
+#: Values of `LoadedScene.kind`.
 KINDS = (None, TREE, STREAMED_SOG, TILES)
 
 #: A cut holds the number of an instance as a uint16.
@@ -65,8 +65,8 @@ class Part:
     """Splats of one instance in a cut.
 
     Attributes:
-        index: (M,) which of the scene's splats are drawn, ascending.
-        weight: (M,) float64 by how much, 0..1, in a continuous cut; None for wholly.
+        index: (M,) indices of the drawn splats in the scene, ascending.
+        weight: (M,) float64 weights of the drawn splats in a continuous cut, 0..1; None if all are 1.
         object_to_world: (4, 4) place of the instance.
     """
 
@@ -77,7 +77,7 @@ class Part:
 
     @functools.cached_property
     def splats(self) -> Splats:
-        """M splats in the space of the scene, with the opacities that are drawn."""
+        """M splats in the space of the scene, with their opacities times their weights."""
         if self.index is self.scene.leaves:
             return self.scene.full
         splats = self.scene.rows(self.index)
@@ -89,19 +89,19 @@ class Part:
 
     @property
     def depth(self) -> NDArray[np.int32]:
-        """(M,) edges from the root to each, or its detail level; 0 of scenes without."""
+        """(M,) edges from the root to each drawn node, or its detail level; 0 in scenes without either."""
         return self.scene.depth[self.index]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Cut:
-    """Splats of some instances that a camera's picture is drawn from.
+    """Splats of instances that a viewer draws for a camera.
 
     Attributes:
         parts: one for each instance.
-        pixel_scale: nodes above it are refined; None where no tree was cut, or nothing refined.
+        pixel_scale: nodes above it are refined; None if no tree was cut, or no node refined.
         reason: why the cut has no more nodes: "budget", "pixel" (the limit), "missing" (chunks), "distance" (of detail
-            levels) or "exhausted" (full detail); None where all is drawn, or the cut is continuous.
+            levels) or "exhausted" (full detail); None at full detail without a cut, and for continuous cuts.
     """
 
     parts: tuple[Part, ...]
@@ -118,7 +118,7 @@ class Cut:
 
     @property
     def nodes(self) -> tuple[Index, ...]:
-        """For each instance (M,) which of its splats, or nodes, are drawn, ascending."""
+        """For each instance (M,) indices of its splats, or nodes, in the cut, ascending."""
         return tuple(part.index for part in self.parts)
 
     @functools.cached_property
@@ -135,13 +135,13 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class Scenes:
-    """Instances and the scenes that they are of; made by `read_scenes`.
+    """Instances and their scenes; made by `read_scenes`.
 
     Attributes:
         instances: at least one.
         loaded: each scene once.
-        of_instance: of each instance, its scene.
-        notes: what a person should know of the files.
+        of_instance: the scene of each instance.
+        notes: remarks on the files, for display.
         axes: for each instance the name of its file, the axis of the world that is up, and which specification says so.
     """
 
@@ -157,19 +157,19 @@ class Scenes:
 
     @property
     def up(self) -> str | None:
-        """The axis of the world that points up, one of `scene.AXES`, where it is the same for all files; else None."""
+        """The axis of the world that points up, one of `scene.AXES`; None if files have different ones."""
         return common_axis(axis for _, axis, _ in self.axes)
 
     @functools.cached_property
     def kind(self) -> str | None:
-        """`LoadedScene.kind` of the scenes that have one; the last of several, with which `viewer` fails."""
+        """`LoadedScene.kind` of the scenes; the last of several different ones, with which `viewer` fails."""
         return max((loaded.kind for loaded in self.loaded), key=KINDS.index)
 
     @functools.cached_property
     def with_cuts(self) -> Sequence[LoadedScene]:
-        """The scenes of which viewers draw cuts, in the order of `forest`: trees, detail levels or tiles.
+        """The trees, scenes at several detail levels, or tiles, in the order of `forest`.
 
-        `UnfitError` for two kinds of them, which no viewer draws.
+        Raises `UnfitError` for two kinds of them, which no viewer draws together.
         """
         scenes = [loaded for loaded in self.loaded if loaded.kind is not None]
         kinds = {kind: loaded for kind in KINDS for loaded in reversed(scenes) if loaded.kind == kind}
@@ -183,7 +183,7 @@ class Scenes:
 
     @functools.cached_property
     def leaves(self) -> int:
-        """Splats of full detail of all instances of which cuts are drawn: what budgets are shares of."""
+        """Splats of all instances `with_cuts` at full detail; budgets in percent are shares of it."""
         return sum(loaded.leaf_count for loaded in self.of_instance if loaded.kind is not None)
 
     def splats_of(self, budget: Budget) -> int:
@@ -198,10 +198,10 @@ class Scenes:
         return Forest(self.with_cuts)
 
     def viewer(self, settings: LodSettings, *, remembers: bool = False) -> Viewer:
-        """Return the viewer of the instances of which cuts are drawn.
+        """Return the viewer of the instances of scenes `with_cuts`.
 
         Args:
-            remembers: of `PlayCanvasViewer`: cuts are found one after the other, along a path.
+            remembers: see `PlayCanvasViewer`.
 
         Raises:
             UnfitError: the budget is too small for the roots, there are too many instances, or scenes for several
@@ -243,7 +243,7 @@ class Scenes:
         return Cut(tuple(Part(loaded, loaded.leaves, None, at.object_to_world) for at, loaded in pairs))
 
     def cut_of(self, found: TreeCut | BlendedCut) -> Cut:
-        """Return what is drawn: of instances with cuts the nodes of this one, of others all splats."""
+        """Return the cut of all instances: the nodes of a viewer's cut, and all splats of scenes without cuts."""
         numbers, parts = itertools.count(), list[Part]()
         for at, loaded in zip(self.instances, self.of_instance, strict=True):
             index, weight = loaded.leaves, None
@@ -269,7 +269,7 @@ class Scenes:
 
 
 class CutFinder:
-    """Finds what a viewer draws of scenes; several threads may use it. Without settings it draws full detail.
+    """Finds cuts of scenes; several threads may use it. Without settings cuts have full detail.
 
     `remembers` and errors are those of `Scenes.viewer`.
     """
@@ -285,7 +285,7 @@ class CutFinder:
             self._continuous = ContinuousCuts(self.viewer)
 
     def with_budget(self, budget: int) -> CutFinder:
-        """Return a finder with another budget and its own viewer, as a viewer begins where its last cut ended."""
+        """Return a finder with another budget and its own viewer, since viewers start from their last cut."""
         twin = copy.copy(self)
         if self.settings is not None and self.viewer is not None:
             twin.settings = replace(self.settings, budget=budget)
@@ -293,13 +293,13 @@ class CutFinder:
         return twin
 
     def find(self, camera: Camera, resident: NDArray[np.bool_] | None = None) -> TreeCut:
-        """Return the cut of trees, detail levels or tiles with (chunks,) bool resident chunks, all unless given."""
+        """Return the viewer's cut with (chunks,) bool resident chunks; all are resident unless given."""
         assert self.viewer is not None and self.settings is not None
         limit = self.settings.limit(camera.fov_y, camera.height)
         return self.viewer.cut(camera, budget=self.settings.budget, smallest=limit, resident=resident)
 
     def cut(self, camera: Camera) -> Cut:
-        """Return the cut of the trees or detail levels, and all splats of scenes that have none."""
+        """Return the cut of all instances, see `Scenes.cut_of`; a continuous one if the settings say so."""
         if self.viewer is None or self.settings is None:
             return self.scenes.full()
         if self._continuous is None or self.settings.continuous is None:
@@ -313,7 +313,7 @@ class CutFinder:
         return self.scenes.cut_of(blended)
 
     def candidates(self) -> Cut:
-        """Return all that some camera may see: whole trees and all levels where cuts are drawn, else full detail."""
+        """Return all splats that the cut of any camera may have: whole trees, all detail levels, all tiles."""
         if self.viewer is None:
             return self.scenes.full()
         pairs = zip(self.scenes.instances, self.scenes.of_instance, strict=True)
@@ -336,11 +336,11 @@ def read_scenes(
     Splats that cannot be drawn are left out of scenes without trees; `Scenes.notes` has their number.
 
     Args:
-        columns: of `Splats` to read; only with `trees_only`; of scenes without trees all are read.
-        trees_only: refuse scenes without a tree, detail levels or tiles, of which no cuts are drawn.
-        through: one of `formats.ROUND_TRIPS`, a coding after which splats are drawn; cuts are those of the scene.
+        columns: of `Splats` to read, with `trees_only`; without it all are read.
+        trees_only: refuse scenes without a tree, detail levels or tiles.
+        through: one of `formats.ROUND_TRIPS`, a coding that rounds splats before they are drawn; cuts stay the same.
         precision: one of `PRECISIONS`, of the nodes that cuts are found with.
-        paged: only cuts are needed, so that only those chunks of large RAD trees are read that cuts need.
+        paged: read only those chunks of large RAD trees that cuts need.
 
     Raises:
         FormatError: a file cannot be read, has no tree but needs one, or does not fit the coding; names the file.
@@ -350,48 +350,21 @@ def read_scenes(
     """
     loaded: dict[Path | int, LoadedScene] = {}
     notes, of_instance, chunks = list[str](), list[LoadedScene](), 0
-    for source in (instance.source for instance in instances):
-        file = source if isinstance(source, Path) else None
-        key = file or id(source)
-        if key in loaded:
-            of_instance.append(loaded[key])
-            continue
-        found: Pages | Scene | DetailScene | TileScene
-        if isinstance(source, Path):
-            to_read = columns if trees_only else COLUMNS
-            found = _read(source, to_read, precision if paged and through is None else None, threads, progress)
-        else:
-            found = source
-        if isinstance(found, Scene):
-            name, scene = file or UNNAMED, found
-            try:
-                scene.check_tree()
-            except TreeError as error:
-                raise TreeError(f"{name}: its tree is broken: {error}") from None
-            if scene.tree is None and trees_only:
+    for instance in instances:
+        key = instance.file or id(instance.source)
+        if key not in loaded:
+            found: Pages | Source = instance.source
+            if isinstance(found, Path):
+                pages = precision if paged and through is None else None
+                found = _read(found, columns if trees_only else COLUMNS, pages, threads, progress)
+            if trees_only and isinstance(found, Scene) and found.tree is None:
                 raise FormatError(
-                    f"{name}: it is not a Level-of-Detail tree, Streamed SOG or 3D Tiles; bake it first with sparklod"
-                    " build-lod"
+                    f"{instance.file or UNNAMED}: it is not a Level-of-Detail tree, Streamed SOG or 3D Tiles; bake it"
+                    " first with sparklod build-lod"
                 )
-            notes += (f"{name}: {note}" for note in scene.notes)
-            if scene.tree is None:
-                scene = _drawable(str(name), scene, notes)
-            size = bytes_of(scene.splats) if file is None else size_of_input(file) or 0
-            drawn = _rounded(scene, through, file, threads)
-            entry: LoadedScene = LoadedScene(file, size, scene, drawn, chunks, precision, threads)
-        else:
-            from .paging import PagedScene, Pages
-
-            if isinstance(found, Pages):
-                assert file is not None
-                empty = replace(found.rad.about(), tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
-                entry = PagedScene(file, size_of_input(file) or 0, empty, empty.splats, chunks, pages=found)
-            else:
-                entry = _loaded_runs(file, found, through, chunks, threads)
-                notes += (f"{entry.name}: {note}" for note in found.notes)
-        loaded[key] = entry
-        of_instance.append(entry)
-        chunks += entry.chunks
+            loaded[key] = _prepared(instance.file, found, chunks, through, precision, threads, notes)
+            chunks += loaded[key].chunks
+        of_instance.append(loaded[key])
     axes = list[tuple[str, str | None, str]]()
     for instance, entry in zip(instances, of_instance, strict=True):
         up = entry.scene.up and rotated_axis(entry.scene.up, instance.object_to_world[:3, :3])
@@ -399,36 +372,13 @@ def read_scenes(
     return Scenes(instances, list(loaded.values()), of_instance, notes, axes)
 
 
-def _loaded_runs(
-    file: Path | None, found: DetailScene | TileScene, through: str | None, chunks: int, threads: int
-) -> LoadedScene:
-    """Return all tiles, or all levels and the environment, as one scene with its files."""
-    splats = found.splats
-    if isinstance(found, DetailScene) and found.environment is not None:
-        degree = min(splats.sh_degree, found.environment.sh_degree)
-        splats = Splats.concat([part.with_max_sh(degree) for part in (splats, found.environment)])
-    if not len(splats):
-        raise InvalidSplatsError(f"{file or UNNAMED}: it has no splats")
-    scene = Scene(splats, **facts_of(found))
-    drawn = _rounded(scene, through, file, threads)
-    if isinstance(found, TileScene):
-        from .cesium import LoadedTiles
-
-        size = found.header.get("bytes", bytes_of(splats))
-        return LoadedTiles(file, size, scene, drawn, chunks, tiles=found)
-    from .playcanvas import LoadedDetail, files_in_memory, read_detail_files
-
-    files = files_in_memory(found) if file is None else read_detail_files(file)
-    return LoadedDetail(file, int(files.sizes.sum()) + files.manifest, scene, drawn, chunks, detail=found, files=files)
-
-
 def _read(
     path: Path, columns: Collection[str], paged: str | None, threads: int, progress: Progress
 ) -> Pages | Scene | DetailScene | TileScene:
-    """Read a file: a scene, or one at several detail levels, or of tiles.
+    """Read a file: a scene, detail levels or tiles; of a RAD tree that is too large for memory its first chunk.
 
     Args:
-        paged: precision of the pages of a file that is too large to be read at once; None to read it nevertheless.
+        paged: precision of the nodes of such a RAD tree; None to read it whole nevertheless.
     """
     with naming(path), memory_errors_translated(), opened(path, threads) as (source, form):
         if paged is not None and form.name == RAD and path != DASH:
@@ -449,18 +399,58 @@ def _read(
         return reader.scene(columns=columns, progress=progress, validate=False)
 
 
-def _drawable(name: str, scene: Scene, notes: list[str]) -> Scene:
-    with naming(name, InvalidSplatsError):
-        splats, dropped = Selection(drop_invalid=True).apply(scene.splats)
-    if dropped:
-        notes.append(f"{name}: left out {describe(dropped)}")
-    return replace(scene, splats=splats)
+def _prepared(
+    file: Path | None,
+    found: Pages | Scene | DetailScene | TileScene,
+    first_chunk: int,
+    through: str | None,
+    precision: str,
+    threads: int,
+    notes: list[str],
+) -> LoadedScene:
+    """Return a scene as viewers hold it, and append notes about it; tiles, and all detail levels, become one scene."""
+    name = file or Path(UNNAMED)
+    if isinstance(found, Scene):
+        scene = found
+        try:
+            scene.check_tree()
+        except TreeError as error:
+            raise TreeError(f"{name}: its tree is broken: {error}") from None
+    elif isinstance(found, (DetailScene, TileScene)):
+        splats = found.splats
+        if isinstance(found, DetailScene) and found.environment is not None:
+            degree = min(splats.sh_degree, found.environment.sh_degree)
+            splats = Splats.concat([part.with_max_sh(degree) for part in (splats, found.environment)])
+        if not len(splats):
+            raise InvalidSplatsError(f"{name}: it has no splats")
+        scene = Scene(splats, **facts_of(found))
+    else:
+        from .paging import PagedScene
 
+        assert file is not None
+        empty = replace(found.rad.about(), tree=LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
+        return PagedScene(file, size_of_input(file) or 0, empty, empty.splats, first_chunk, pages=found)
+    notes += (f"{name}: {note}" for note in found.notes)
+    if isinstance(found, Scene) and scene.tree is None:
+        with naming(name, InvalidSplatsError):
+            splats, dropped = Selection(drop_invalid=True).apply(scene.splats)
+        notes += [f"{name}: left out {describe(dropped)}"] if dropped else []
+        scene = replace(scene, splats=splats)
+    drawn = scene.splats
+    if through is not None:
+        from ..codecs.losses import after
 
-def _rounded(scene: Scene, through: str | None, file: Path | None, threads: int) -> Splats:
-    """Return the splats of a scene as an encoding of `codecs.losses.after` rounds them; None rounds nothing."""
-    if through is None:
-        return scene.splats
-    from ..codecs.losses import after
+        drawn = after(through, name, scene, threads)
+    if isinstance(found, Scene):
+        size = bytes_of(scene.splats) if file is None else size_of_input(file) or 0
+        return LoadedScene(file, size, scene, drawn, first_chunk, precision, threads)
+    if isinstance(found, TileScene):
+        from .cesium import LoadedTiles
 
-    return after(through, file or Path(UNNAMED), scene, threads)
+        size = found.header.get("bytes", bytes_of(scene.splats))
+        return LoadedTiles(file, size, scene, drawn, first_chunk, tiles=found)
+    from .playcanvas import LoadedDetail, files_in_memory, read_detail_files
+
+    files = files_in_memory(found) if file is None else read_detail_files(file)
+    size = files.manifest + sum(map(sum, files.requests))
+    return LoadedDetail(file, size, scene, drawn, first_chunk, detail=found, files=files)

@@ -6,18 +6,16 @@ import itertools
 import threading
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cameras.camera import Camera
 from ..lod.kernels import cut
 from ..lod.kernels.cut import find_cut
 from ..model.lod_tree import CHUNK_BITS, CHUNK_NODES
 from .loaded_scene import Forest, TreeCut, TreeInstance, views_of
-
-if TYPE_CHECKING:
-    from ..cameras.camera import Camera
 
 #: Initial size of the buffers, in visited nodes per node of a cut: enough if every refined node has two or more
 #: children; for other trees the buffers grow.
@@ -27,17 +25,12 @@ VISITS = 2
 #: unnecessarily costs less than another round. Chosen; cuts do not depend on it.
 GUESS = 0.97
 
-#: Share of the chunks that a cut lacks that is read before the cut is found again, the most important ones first. With
-#: fewer, it is found more often; with more, chunks are read that it turns out not to need. Chosen.
+#: Share of the missing chunks of a cut, the most important ones, that is read before the cut is found again. A smaller
+#: share takes more rounds; a larger one reads chunks that the cut turns out not to need. Chosen.
 READ_SHARE = 0.5
 
 #: Why a cut is not finer, by the kernel's code.
-REASONS = {
-    cut.BUDGET: "budget",
-    cut.PIXEL: "pixel",
-    cut.MISSING: "missing",
-    cut.EXHAUSTED: "exhausted",
-}
+REASONS = {cut.BUDGET: "budget", cut.PIXEL: "pixel", cut.MISSING: "missing", cut.EXHAUSTED: "exhausted"}
 
 
 class SparkViewer:
@@ -66,7 +59,7 @@ class SparkViewer:
             self._read(resident)
             return self._cut(camera, budget, smallest, resident)
         while True:
-            # As long as chunks are not in memory that would be read next, the cut is one of a viewer that lacks them.
+            # This cut takes the chunks in memory for resident, so its demand names those to be read next.
             present = np.ones(self.forest.chunks, np.bool_)
             for chunks, pages in self._pages:
                 present[chunks] = pages.present
@@ -74,20 +67,20 @@ class SparkViewer:
             missing = np.flatnonzero((cut.demand > 0) & ~present)
             if not len(missing):
                 return cut
-            # The most important chunk is needed for certain, as a cut takes nodes by their importance; others may turn
-            # out not to be, once the nodes in that one take their share of the budget.
+            # The most important chunk is needed for certain, since a cut refines nodes by their importance; others may
+            # not be, once the nodes of that chunk take their share of the budget.
             missing = missing[np.argsort(-cut.demand[missing], kind="stable")]
             now = np.zeros(len(present), np.bool_)
             now[missing[: int(np.ceil(READ_SHARE * len(missing)))]] = True
             self._read(now)
 
     def _read(self, wanted: NDArray[np.bool_]) -> None:
-        """Read those of these chunks, (chunks,) bool, that are not in memory; errors are those of `Pages.read`."""
+        """Read the wanted chunks, (chunks,) bool, that are not in memory; errors are those of `Pages.read`."""
         for chunks, pages in self._pages:
             pages.read(np.flatnonzero(wanted[chunks] & ~pages.present).tolist())
 
     def _cut(self, view: Camera, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
-        """Return the cut with these chunks, which are in memory."""
+        """Return the cut with (chunks,) bool resident chunks, which are in memory."""
         start = time.perf_counter()
         views = views_of(self.forest, self.instances, view)
         trees = cut.Trees(self._nodes, views, present, CHUNK_BITS)
@@ -128,7 +121,3 @@ class SparkViewer:
             demand=demand,
             seconds=time.perf_counter() - start,
         )
-
-    def forget(self) -> None:
-        """Discard the threshold of this thread's last cut. The next cut is the same either way."""
-        self._memory.guess = 0.0

@@ -187,7 +187,7 @@ def state(
     counts: np.ndarray = COUNTS,
 ) -> tuple[list[int], np.ndarray]:
     """Levels drawn of each region, and priorities of files, where some files are resident."""
-    files = DetailFiles(np.where(counts > 0, [0, 1, 2], -1), np.array([400, 200, 100, 50]), 3, 9)
+    files = DetailFiles(np.where(counts > 0, [0, 1, 2], -1), [(400,), (200,), (100,), (50,)], 3, 9)
     past = None if before is None else np.array(before)
     distances, resident = np.array([1.0, 4.0, 9.0])[: len(counts)], np.isin(np.arange(4), there)
     chains = Chains.of(counts, DetailRule())

@@ -101,7 +101,7 @@ def test_the_manifest_the_environment_and_coarse_levels_arrive_first(regions: Sc
     assert order[0] == files.environment
     levels = [number // 3 for number in order[1:]]
     assert levels == sorted(levels, reverse=True)
-    received = files.manifest + np.cumsum(files.sizes[order])
+    received = files.manifest + np.cumsum([sum(files.requests[number]) for number in order])
     assert [arrival.bytes for arrival in arrivals[1:]] == received.tolist()
     seconds = received / 1e6
     assert [arrival.seconds for arrival in arrivals[1:]] == pytest.approx(seconds.tolist())
