@@ -1,4 +1,4 @@
-"""`Camera`, a pinhole camera in the world; frames and lenses of a path before they become cameras, and its settings."""
+"""`Camera`, a pinhole camera in the world; frames and lenses as files have them; settings of camera paths."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Camera:
 
         Args:
             eye, target: x, y, z in world units.
-            up: x, y, z of what is up in the picture; -y in scenes as training leaves them.
+            up: x, y, z of the direction that is up in the picture; -y in scenes as trainers write them.
             fov_y: vertical field of view, degrees.
 
         Raises:
@@ -101,8 +101,8 @@ class Camera:
         return 2 * math.atan(self.height / (2 * self.focal[1]))
 
 
-#: Largest deviation of an element of R^T R from a multiple of the identity. Files that round to three decimals stay
-#: well below it.
+#: Largest deviation of an element of R^T R from a multiple of the identity. Numbers with three decimals have a much
+#: smaller one.
 SKEW = 0.02
 
 #: From OpenCV's axes to OpenGL's and back: y and z change their sign.
@@ -164,7 +164,7 @@ def pose(rotation: ArrayLike, position: ArrayLike) -> Matrix:
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Matrix:
     """Return the (4, 4) camera-to-world matrix, in OpenGL's axes, of a camera at `eye` that looks at `target`.
 
-    Another direction replaces the up axis if that is along the line of sight. `ValueError` if eye and target, world
+    If the up axis is along the line of sight, a coordinate axis replaces it. `ValueError` if eye and target, world
     units, are the same point, or too far apart.
     """
     eye, target = np.asarray(eye, np.float64), np.asarray(target, np.float64)
@@ -206,7 +206,7 @@ def rotation_of(quat_wxyz: ArrayLike) -> Matrix:
 #: x, y and z in world units, or of a direction.
 Point = tuple[float, float, float]
 
-#: Vertical field of view in radians and frame rate where neither file nor user gives one.
+#: Vertical field of view in radians, and frame rate, unless file or user give one.
 DEFAULT_FOV_Y = math.radians(60)
 DEFAULT_FPS = 30.0
 
@@ -228,13 +228,10 @@ DEFAULT_SECONDS = 2.0
 #: (K,) int64 numbers of frames, from 0.
 Numbers = NDArray[np.int64]
 
-#: Up axis of cameras without one.
-DEFAULT_UP: Point = AXES[ASSUMED]
-
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Intrinsics of a camera in a file; None for those that the file does not have.
+    """Intrinsics of a camera in a file; None for missing ones.
 
     Attributes:
         focal: fx, fy in pixels; only used together with a size.
@@ -260,7 +257,7 @@ class Frame:
     Attributes:
         matrix: (4, 4), in the axes of its format.
         time: seconds from an arbitrary start; None if the file has no times.
-        axes: of this matrix if they are certain, since it was computed from an eye and a target; otherwise None.
+        axes: of this matrix, if known from its origin; None for those of the file or the user.
     """
 
     matrix: Matrix
@@ -301,8 +298,8 @@ class Settings:
         fps: frames a second; times are then computed from the numbers of the frames.
         every: keep every n-th frame only.
         up: x, y, z of the up axis of cameras that have only an eye and a target.
-        up_of_scene: called where neither file nor user says it; returns the axis of the world of the splats that is up,
-            one of `scene.AXES`, or None if it is unknown.
+        up_of_scene: called unless file or user give an up axis; returns the axis of the world of the splats that is
+            up, one of `scene.AXES`, or None if it is unknown.
     """
 
     axes: Axes | None = None
@@ -316,7 +313,7 @@ class Settings:
 
     @property
     def up_axis(self) -> Point:
-        """x, y, z of the up axis that was chosen, or else that of the scene, in the world of the cameras."""
+        """x, y, z of the user's up axis, or else of that of the scene, in the world of the cameras."""
         if self.up is not None:
             return self.up
         axis = self.up_of_scene()
@@ -328,7 +325,7 @@ class Settings:
 
 
 def camera_of(pose: Matrix, lens: Intrinsics, time: float, name: str, settings: Settings) -> Camera:
-    """Return the camera of a rigid pose in OpenGL's axes, with defaults for what neither file nor user says.
+    """Return the camera of a rigid pose in OpenGL's axes, with defaults for a lens that neither file nor user gives.
 
     The text of a `ValueError` about the lens continues a sentence about the camera.
     """

@@ -38,7 +38,7 @@ ORIGIN = Origin("", CameraPathError)
 
 @dataclass(frozen=True)
 class Files:
-    """The file of a camera path and those that belong to it.
+    """The file of a camera path and its companions.
 
     Attributes:
         contents: bytes of each file by name; the requested one comes first.
@@ -53,7 +53,7 @@ class Files:
 
     @cached_property
     def text(self) -> str | None:
-        """The first file as text; None if it is not text."""
+        """Text of the first file; None if it is not text."""
         return decoded(self.data)
 
     @cached_property
@@ -80,9 +80,9 @@ class Parsed:
 
     Attributes:
         frames: in order; or a function that computes frames between keys from their numbers.
-        notes: what was ignored or assumed, one sentence each, for display.
+        notes: ignored parts and assumptions, one sentence each, for display.
         turned: every camera has its own up axis.
-        count: number of frames that are computed, rounded up and at least one.
+        count: number of frames that the function computes, rounded up and at least one.
     """
 
     frames: Sequence[Frame] | Callable[[Numbers], list[Frame]]
@@ -172,7 +172,7 @@ LARGEST = 1 << 31
 def read(files: Files, *, format: str | None = None, settings: Settings | None = None) -> CameraPath:
     """Return the cameras of a file; `format` is the name of a row of `FORMATS`, None to recognize it by the content.
 
-    `CameraPathError` if the file has no known format or is broken, or a camera makes no sense.
+    `CameraPathError` if the file has no known format or is broken, or a camera is impossible.
     """
     settings = settings or Settings()
     if not any(files.contents.values()):
@@ -267,12 +267,12 @@ COLUMNS = {"name", *itertools.chain.from_iterable(KEYS)}
 
 
 def recognises_sparklod(files: Files) -> bool:
-    """Return whether its field format says so."""
+    """Return whether the file names the format."""
     return files.json is not None and files.json.has("format") and files.json.value["format"] == FORMAT
 
 
 def parse_sparklod(files: Files, settings: Settings) -> Parsed:
-    """Return its frames, or those between its keyframes."""
+    """Parse frames, or keyframes with the frames between them."""
     root = files.object()
     if root.has("version") and root.value["version"] != VERSION:
         raise CameraPathError(f"version {quoted_value(root.value['version'])} is unknown, only {VERSION} is read")
@@ -337,7 +337,7 @@ def _lens(item: CameraJson, default: Intrinsics) -> Intrinsics:
 
 
 def recognises_csv(files: Files) -> bool:
-    """Return whether its first line names the columns of a pose."""
+    """Return whether the first line names the columns of a pose."""
     names = {*_names(files)}
     return names >= {*POSITION, *QUAT} or names >= {*POSITION, *TARGET}
 
@@ -347,13 +347,13 @@ def _names(files: Files) -> list[str]:
 
 
 def resembles_csv(files: Files) -> bool:
-    """Return whether it looks like a failed attempt: it is named .csv, or its first line names some of the columns."""
+    """Return whether the file is meant as CSV: it is named .csv, or its first line names two of the columns."""
     names = _names(files)
     return files.path.suffix.lower() == ".csv" or len(COLUMNS.intersection(names)) > 1
 
 
 def parse_csv(files: Files, settings: Settings) -> Parsed:
-    """Parse a camera per row, with named columns."""
+    """Parse rows with a camera each, below a line that names the columns."""
     lines, names = files.lines(), _names(files)
     if not recognises_csv(files):
         missing = min(([name for name in POSITION + way if name not in names] for way in (TARGET, QUAT)), key=len)

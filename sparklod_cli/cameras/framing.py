@@ -34,8 +34,8 @@ COVERED = 0.999
 #: typical cell cover below which a cell is sparse: stray splats, haze and stars, which are not framed.
 CELL, FEW, SPARSE = 1 / 8, 256, 0.05
 
-#: Splats farther from the middle than this multiple of the radius of the ball that most splats are in are backdrop,
-#: such as a sky or stray splats of training, and are not framed.
+#: Splats farther from the middle than this multiple of the size of the scene are backdrop, such as a sky, or stray, and
+#: are not framed.
 OUTSIDE = 3.0
 
 #: Sample size, in splats; a larger one makes no visible difference.
@@ -72,13 +72,13 @@ class Balls:
 
     @classmethod
     def concat(cls, parts: Iterable[Balls]) -> Balls:
-        """Concatenate the balls of several parts, at least one."""
+        """Concatenate the spheres of several parts, at least one."""
         every = list(parts)
         return cls(np.concatenate([part.center for part in every]), np.concatenate([part.radius for part in every]))
 
 
 def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matrix) -> Balls:
-    """Return the bounding spheres, in the world, of the splats of an object that have finite numbers."""
+    """Return the bounding spheres, in the world, of an object's splats; splats with numbers not finite are left out."""
     with np.errstate(all="ignore"):
         center = splats.center[index].astype(np.float64) @ object_to_world[:3, :3].T + object_to_world[:3, 3]
         times = float(np.cbrt(np.linalg.det(object_to_world[:3, :3])))
@@ -89,14 +89,10 @@ def balls_of(splats: Splats, index: NDArray[Any] | slice, object_to_world: Matri
 
 
 def framing(center: NDArray[np.floating]) -> tuple[NDArray[np.float64], float]:
-    """Return the middle of a scene and the radius of a ball around it that most splats are in.
+    """Return the (3,) middle of a scene, the median of each coordinate, and its size, the radius of most splats.
 
-    Args:
-        center: (N, 3) of the splats, world units. What is not finite is left out; `InvalidSplatsError` if nothing is
-            left.
-
-    Returns:
-        (3,) the median of each coordinate, and a radius above 0.
+    `center`, (N, 3), and the size, above 0, are in world units. Centres that are not finite are left out;
+    `InvalidSplatsError` if all are.
     """
     sample = np.asarray(center[:: max(len(center) // SAMPLE, 1)], np.float64)
     sample = sample[np.isfinite(sample).all(axis=1)]
@@ -119,29 +115,29 @@ def covered(scene: Balls) -> Balls:
     # The nearest is always kept, however large it is.
     near = reach <= max(OUTSIDE * radius, float(reach.min()))
     center, size, reach = center[near], size[near], reach[near]
-    # Of the cells around the middle, those are dense that splats cover nearly as much of as of a typical cell.
+    # A cell is dense if splats cover nearly as much of it as of a typical cell.
     side = radius * max(CELL, (FEW / len(center)) ** (1 / 3))
     area = np.clip(size, SPECK * radius, side) ** 2
     dense = np.zeros(len(area), np.bool_)
-    for shift in (0.0, 0.5):  # of the cells at the border of something, either set may have thin slices
+    for shift in (0.0, 0.5):  # cells at the border of an object may have thin slices of it in either set
         _, cell = np.unique(np.floor((center - middle) / side + shift).astype(np.int64), axis=0, return_inverse=True)
         cell = cell.reshape(-1)
         cover = np.bincount(cell, area)
-        # The typical cell is the one that the middle of all that is covered lies in.
+        # The typical cell is the median, weighted by cover.
         order = np.argsort(cover)
         typical = cover[order[np.searchsorted(np.cumsum(cover[order]), cover.sum() / 2)]]
         dense |= (cover >= SPARSE * typical)[cell]
     most = float(np.quantile(reach[dense], COVERED, method="higher"))
     framed = dense & (reach <= most)
     center, size = center[framed], size[framed]
-    # Nothing is a point: a camera in line with all of them would be in their midst. Nor is anything, far out, smaller
-    # than the steps of the numbers there.
+    # No ball is a point: a camera in line with several would be among them. Far out, none is smaller than the steps of
+    # float32 there.
     least = max(SPECK * most, STEPS * float(np.abs(center).max())) or radius
     return Balls(center, np.maximum(size, least))
 
 
 def middle_of(scene: Balls) -> Matrix:
-    """(3,) the middle of the bounding box of these balls."""
+    """Return the (3,) middle of the bounding box of balls."""
     radius = scene.radius[:, None]
     middle: Matrix = ((scene.center - radius).min(axis=0) + (scene.center + radius).max(axis=0)) / 2
     return middle
@@ -150,12 +146,12 @@ def middle_of(scene: Balls) -> Matrix:
 def _support(scene: Balls, camera: Camera) -> tuple[Matrix, Matrix, Matrix]:
     """Return the reach of a scene beyond the sides of a camera's view, if the camera were at the origin.
 
-    A ball is inside where it is behind all four sides, right, left, top and bottom, so the camera sees all of them
-    where its position, times the normal of each side, is at least this reach.
+    A ball is in view if it is behind all four sides, right, left, top and bottom. So the camera sees all balls if its
+    position times the normal of each side is at least this reach.
 
     Returns:
-        (4,) the reach, world units, and of both pairs of sides, (2,), the share of their normals that is to the side,
-        and that is backwards.
+        (4,) the reach, world units; and (2,) the sideways and (2,) the backward components of the normals of both
+        pairs of sides.
     """
     half = FILLED * np.array([camera.width, camera.height]) / (2 * np.asarray(camera.focal))
     back = half / np.hypot(1, half)
@@ -167,7 +163,7 @@ def _support(scene: Balls, camera: Camera) -> tuple[Matrix, Matrix, Matrix]:
 
 
 def fitted(camera: Camera, scene: Balls) -> Camera:
-    """Return a camera, centred on its picture, in the same direction, which has a scene just inside the picture."""
+    """Return a camera in the same direction, moved so that a scene is centred in its picture and just fits."""
     middle = middle_of(scene)
     reach, aside, back = _support(Balls(scene.center - middle, scene.radius), camera)
     away = float(((reach[::2] + reach[1::2]) / (2 * back)).max())
@@ -178,9 +174,9 @@ def fitted(camera: Camera, scene: Balls) -> Camera:
 
 
 def distance(cameras: Sequence[Camera], center: Matrix, scene: Balls) -> float:
-    """Return the distance from their target, in world units, at which cameras have a scene in their pictures.
+    """Return the distance from their target, (3,) `center`, at which the pictures of all cameras contain a scene.
 
-    Only the directions of the cameras count. `center`, (3,), is in the middle of all pictures.
+    Only the directions of the cameras have an effect, not their positions.
     """
     local = Balls(scene.center - center, scene.radius)
     needed = []
@@ -191,10 +187,7 @@ def distance(cameras: Sequence[Camera], center: Matrix, scene: Balls) -> float:
 
 
 def reach(near: float, far: float, cameras: Sequence[Camera], scene: Balls) -> tuple[float, float]:
-    """Near and far distances, moved apart where they would leave out a part of a scene that cameras look at.
-
-    They are along the axis of a camera, world units; `scene` is all that its splats cover.
-    """
+    """Return near and far distances along the axes of cameras, world units, moved apart to enclose a scene."""
     sample = scene.center[:: max(len(scene.center) // SAMPLE, 1)]
     corners = scene.box if scene.box is not None else np.stack([scene.center.min(axis=0), scene.center.max(axis=0)])
     largest = scene.largest if scene.largest is not None else float(scene.radius.max())

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,14 +35,11 @@ from .camera import (
 )
 from .camera_formats import Axes
 
-if TYPE_CHECKING:
-    from .framing import Balls
-
 #: x, y and z in world units.
 Point = tuple[float, ...]
 
 #: Returns the bounding spheres of the splats; called only where a camera is placed by the scene.
-Scene = Callable[[], "Balls"]
+Scene = Callable[[], framing.Balls]
 
 #: Most that a camera turns from one frame of a movement to the next, degrees: a quarter of the default field of view.
 MOST_TURN = 15.0
@@ -57,7 +52,7 @@ class CameraPath:
     Attributes:
         cameras: at least one; camera-to-world in OpenGL's axes, in the world of the splats.
         format: their origin, for display.
-        notes: what was ignored or assumed, one sentence each, for display.
+        notes: ignored parts and assumptions, one sentence each, for display.
         numbers: number of each camera in the file or on the whole path, from 0.
     """
 
@@ -76,10 +71,10 @@ class CameraPath:
         return self.cameras[index]
 
     def follows(self, index: int) -> bool:
-        """Return whether a camera goes on from where the one before it was, as frames of a movement do.
+        """Return whether a camera continues the movement of the one before it.
 
         It does if its time is later, its picture has the same size, and it is turned by no more than `MOST_TURN`.
-        Cameras of single views have no times of their own, and those around an object are turned by more.
+        Cameras of single views all have the same time, and cameras around an object are turned by more.
         """
         if index == 0:
             return False
@@ -113,7 +108,7 @@ def cameras_of(
         count: number of frames, rounded up and at least one, where a function computes them.
 
     Raises:
-        CameraPathError: there are no cameras, or one makes no sense, which the text names; its subclass
+        CameraPathError: there are no cameras, or one is impossible, which the text names; its subclass
             `TooManyCamerasError` if there are too many.
     """
     every, is_listed = settings.every, isinstance(frames, Sequence)
@@ -179,16 +174,14 @@ def orbit(
     `distance` from there is in world units, None for where the scene fits the image; `elevation` in degrees.
     """
     up, tilt = settings.up_axis, math.radians(elevation)
+    some = np.arange(0, count, -(-count // framing.CAMERAS))
+    ahead = _frames_around((0.0, 0.0, 0.0), np.ones(len(some)), 2 * math.pi * some / count, tilt, up)
+    target, away = _aim(ahead, center, distance, settings, scene)
 
-    def frames(numbers: Numbers, center: Point, distance: float) -> list[Frame]:
-        turn = 2 * math.pi * numbers / count
-        return _frames_around(center, np.full(len(numbers), distance), turn, tilt, up)
+    def frames(numbers: Numbers) -> list[Frame]:
+        return _frames_around(target, np.full(len(numbers), away), 2 * math.pi * numbers / count, tilt, up)
 
-    if center is None or distance is None:
-        some = np.arange(0, count, -(-count // framing.CAMERAS))
-        center, distance = _aim(frames(some, (0.0, 0.0, 0.0), 1), center, distance, settings, scene)
-    around = functools.partial(frames, center=center, distance=distance)
-    return cameras_of(around, settings, "an orbit", count=count)
+    return cameras_of(frames, settings, "an orbit", count=count)
 
 
 def dolly(
@@ -200,16 +193,14 @@ def dolly(
     """
     up, tilt = settings.up_axis, math.radians(elevation)
     count = max(2, round(seconds * (settings.fps or DEFAULT_FPS)))
-    if center is None or distance is None:
-        ahead = _frames_around((0.0, 0.0, 0.0), np.ones(1), np.zeros(1), tilt, up)
-        center, distance = _aim(ahead, center, distance, settings, scene, DOLLY_START)
+    ahead = _frames_around((0.0, 0.0, 0.0), np.ones(1), np.zeros(1), tilt, up)
+    target, far = _aim(ahead, center, distance, settings, scene, DOLLY_START)
 
-    def frames(numbers: Numbers, center: Point, far: float) -> list[Frame]:
+    def frames(numbers: Numbers) -> list[Frame]:
         away = far * (1 / DOLLY_ZOOM) ** (numbers / (count - 1))  # the scene grows by one factor a frame
-        return _frames_around(center, away, np.zeros(len(numbers)), tilt, up)
+        return _frames_around(target, away, np.zeros(len(numbers)), tilt, up)
 
-    towards = functools.partial(frames, center=center, far=distance)
-    return cameras_of(towards, settings, "a dolly", count=count)
+    return cameras_of(frames, settings, "a dolly", count=count)
 
 
 def _aim(
@@ -222,8 +213,10 @@ def _aim(
 ) -> tuple[Point, float]:
     """Return the target of cameras, (3,), and their distance from there; both are chosen for the scene where None.
 
-    The cameras of `frames` may be at any distance; a chosen one is `times` that at which the scene just fits the image.
+    The cameras of `frames` may be at any distance; a chosen distance is `times` that at which the scene fits the image.
     """
+    if center is not None and distance is not None:
+        return center, distance
     visible = framing.covered(scene())
     target = framing.middle_of(visible) if center is None else np.asarray(center, np.float64)
     if distance is None:
@@ -236,7 +229,7 @@ def _aim(
 
 
 def whole_scene(elevation: float, settings: Settings, scene: Scene) -> CameraPath:
-    """Return one camera in front of the middle of the scene, and above it, that just has all of it in its picture."""
+    """Return one camera in front of the scene, `elevation` degrees above it, whose picture the scene just fits."""
     path = orbit(1, (0.0, 0.0, 0.0), 1.0, elevation, settings, scene)
     fitted = framing.fitted(path.cameras[0], framing.covered(scene()))
     return dataclasses.replace(path, cameras=(fitted,))
@@ -245,7 +238,7 @@ def whole_scene(elevation: float, settings: Settings, scene: Scene) -> CameraPat
 def single_views(views: Sequence[tuple[Point, Point]], settings: Settings, *, named: bool = False) -> CameraPath:
     """Return a camera at time 0 for each pair, at least one, of an eye and the target that it looks at.
 
-    `named` cameras are called after their eye and target.
+    The names of `named` cameras have their eye and target.
     """
     frames = []
     for view in views:
@@ -286,15 +279,13 @@ class Key:
 def between(
     keys: Sequence[Key], fps: float | None, up: ArrayLike, lens: Intrinsics = NO_LENS, seconds: float = DEFAULT_SECONDS
 ) -> tuple[Callable[[Numbers], list[Frame]], float]:
-    """Return a function of numbers of frames, from the first key to the last, and how many frames there are.
-
-    The frames are on a Catmull-Rom spline through all keys.
+    """Return a function that computes frames from their numbers, on a Catmull-Rom spline through all keys; their count.
 
     Eye, target, up axis and field of view are interpolated separately, so that a target of two keys stays in view
     between them. The parameter of the spline is time. Keys without times are spaced centripetally, by the square roots
     of the distances between them (Yuksel, Schaefer and Keyser 2011), which avoids loops and cusps.
 
-    `up` and `lens` are those of keys without; `seconds` is the mean time from key to key, if keys have no times.
+    `up` and `lens` are for keys without their own; `seconds` is the mean time from key to key, if keys have no times.
     `CameraPathError` if there are fewer than two keys, some times are missing, or they do not increase.
     """
     rate = fps or DEFAULT_FPS

@@ -28,7 +28,7 @@ VERSION = 2
 
 
 def recognises_supersplat(files: Files) -> bool:
-    """Return whether it has poses, animations or cameras as in one of the three files."""
+    """Return whether the file has poses, animations or cameras of SuperSplat."""
     root = files.json
     if root is None:
         return False
@@ -59,7 +59,7 @@ def parse_supersplat(files: Files, settings: Settings) -> Parsed:
 
 
 def _of_track(track: CameraJson, fov: float, first_version: bool, settings: Settings) -> Parsed:
-    """Return an item of animTracks. Version 1 has one field of view for all keys, and at first counted in seconds."""
+    """Parse an item of animTracks. Version 1 has one field of view for all keys; its first files count in seconds."""
     rate = track.optional("frameRate", CameraJson.positive, FRAME_RATE)
     times = np.array(track.get("keyframes", "times").numbers())
     if not track.has("frameRate"):
@@ -81,7 +81,7 @@ def _of_track(track: CameraJson, fov: float, first_version: bool, settings: Sett
 
 
 def _of_document(root: CameraJson, settings: Settings) -> Parsed:
-    """Return the frames of a project; poses beyond the end of its time line are ignored, with a note."""
+    """Parse a project; poses beyond the end of its time line are ignored, with a note."""
     line = root.get("timeline")
     count, rate = line.number("frames"), line.optional("frameRate", CameraJson.positive, FRAME_RATE)
     keys = {}
@@ -117,10 +117,10 @@ def _fov(root: CameraJson) -> float:
 def _curve(
     times: Matrix, points: Matrix, smoothness: float, length: float | None, step: bool
 ) -> Callable[[Matrix], Matrix]:
-    """Return the interpolation between keys.
+    """Return a function that interpolates between (n, 7) points, keys at (n,) times in frames.
 
-    `times`, (n,), and `length`, None for a path that is no loop, are in frames; `smoothness` is 0 for straight lines
-    between the `points`, (n, 7), to 1; `step` holds each key until the next.
+    `length` is that of a loop, in frames, None for a path that does not repeat. `smoothness` is 0, for straight lines,
+    to 1; `step` holds each key until the next.
     """
     if not len(times):
         raise CameraPathError("it has no keyframes")

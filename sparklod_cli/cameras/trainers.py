@@ -29,7 +29,7 @@ PANORAMAS = ("EQUIRECTANGULAR", "OMNIDIRECTIONAL", "VR180")
 
 
 def recognises_nerfstudio(files: Files) -> bool:
-    """Return whether it has a camera_path."""
+    """Return whether the file has a camera_path."""
     return files.json is not None and files.json.has("camera_path")
 
 
@@ -99,7 +99,7 @@ def _lens(item: CameraJson, root: CameraJson) -> Intrinsics:
 
 
 def recognises_inria(files: Files) -> bool:
-    """Return whether it is a list of positions and rotations."""
+    """Return whether the file is a list of positions and rotations."""
     return files.json is not None and files.json.first_has("position", "rotation")
 
 
@@ -129,7 +129,7 @@ COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 def recognises_open3d(files: Files) -> bool:
-    """Return whether it is JSON of that class, or begins with three whole numbers and a row of four."""
+    """Return whether the file is JSON of that class, or begins with three whole numbers and a row of four."""
     if files.json is not None:
         return files.json.has("class_name") and files.json.value["class_name"] == CLASS
     rows = [line.split() for line in (files.text or "").split("\n", 2)[:2]]

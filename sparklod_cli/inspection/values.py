@@ -170,9 +170,9 @@ def quantity(splats: Splats, name: str) -> FloatArray:
         return QUANTITIES[name].of(splats)
 
 
-def histogram_of(splats: Splats, name: str, *, bins: int = 40) -> Histogram:
+def histogram_of(splats: Splats, name: str) -> Histogram:
     """Count the numbers of a quantity, one of `names_of(splats)`, in bins."""
-    return histogram(quantity(splats, name), bins=bins, log=False if QUANTITIES[name].linear else None)
+    return histogram(quantity(splats, name), linear=QUANTITIES[name].linear)
 
 
 def statistics_of(blocks: ReportBlocks, tally: ValueTally, *, all_quantities: bool, threads: int) -> ValueFacts:

@@ -109,8 +109,8 @@ COLUMNS = (
     Column("traverse_ms", float, ".3f", "ms", "time to find the cut, on one thread; left out with `--no-timing`"),
 )
 
-#: Figures of a visitor who opens a page in front of the first camera and waits there, with `--bandwidth`. No table has
-#: them, but the summary, and assertions can be about them.
+#: Waits of a visitor who opens a page in front of the first camera and stays there, with `--bandwidth`. They are in the
+#: summary and may be asserted, but are no columns of the table.
 LOADING = (
     Column("first_picture_s", float, ".4f", "s", "time until anything is drawn"),
     Column("resident_90_s", float, ".4f", "s", "time until 90 % of the splats of the cut are resident"),
@@ -128,7 +128,7 @@ OF_BUDGETS = ("budget", "budget_used")
 #: Columns that differ from run to run.
 TIMING = ("traverse_ms",)
 
-#: Why all cells of a column can be empty.
+#: Reasons why all cells of a column may be empty.
 EMPTY = {
     "time_s": "the path has no times",
     "complete_in_s": "it needs --bandwidth",
@@ -142,7 +142,6 @@ EMPTY = {
     **dict.fromkeys(("projected_px_p50", "projected_px_p95"), "no splat is inside the frustum on any frame"),
     **dict.fromkeys((column.name for column in LOADING), "it needs --bandwidth, and a --chunk-cache that suffices"),
 }
-
 
 UNITS = {column.name: column.unit for column in COLUMNS}
 
@@ -160,7 +159,7 @@ STATISTICS = ("min", "p50", "p95", "max")
 
 @dataclass(frozen=True)
 class FrameStatistics:
-    """Statistics over the `frames` that have a value of a column, or of `IN_FRUSTUM`."""
+    """Statistics of a column, or of `IN_FRUSTUM`, over the `frames` that have a value of it."""
 
     name: str
     unit: str
@@ -173,11 +172,7 @@ class FrameStatistics:
 
 @dataclass(frozen=True)
 class Moment:
-    """The frame with the largest value of one of the criteria `MOMENTS`.
-
-    Attributes:
-        unit: of the value; "limit" is a multiple of the pixel scale limit.
-    """
+    """The frame with the largest value of one of the criteria `MOMENTS`; the unit "limit" is the pixel-scale limit."""
 
     criterion: str
     frame: int
@@ -213,7 +208,7 @@ class Summary:
     loading: Row | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """As plain lists, dicts and numbers, for JSON; quantities and moments by their names."""
+        """Return plain lists, dicts and numbers for JSON; quantities and moments are dicts by their names."""
         plain = asdict(self)
         for group, name in (("quantities", "name"), ("moments", "criterion")):
             plain[group] = {each.pop(name): each for each in plain[group]}
@@ -221,7 +216,7 @@ class Summary:
 
 
 def summarize(rows: Iterable[Row], loading: Row | None = None) -> Summary:
-    """Summary of the rows of all frames, in order; rows of single instances are ignored."""
+    """Return the summary of the rows of all frames, in order; rows of single instances are ignored."""
     frames = totals(rows)
     times = numbers(frames, "time_s")
     reasons = Counter(str(row["stop_reason"]) for row in frames if row["stop_reason"] is not None)
@@ -255,8 +250,8 @@ def _rounded(value: Number) -> Number:
     return value if isinstance(value, int) else float(f"{value:.9g}")
 
 
-#: Criteria for extreme frames: the column, None for the least pixel scale of a
-#: refined node as a multiple of the limit, the threshold that it must exceed, and the unit.
+#: Criteria for extreme frames: the column, None for the least pixel scale of a refined node as a multiple of the limit;
+#: the value that a frame must exceed; and the unit.
 MOMENTS: dict[str, tuple[str | None, Number, str]] = {
     "churn": ("churn", 0, "share"),
     "bytes": ("bytes_new", 0, "bytes"),
@@ -274,7 +269,7 @@ Extremes = dict[str, tuple[Number, Row]]
 def add_extremes(most: Extremes, row: Row, *, is_first: bool) -> list[str]:
     """Add the row of the next frame, and return the criteria in which it exceeds all earlier frames.
 
-    The bytes fetched by the first frame do not count, since it has to fetch everything.
+    The bytes of the first frame do not count, since it fetches everything.
     """
     criteria = []
     for criterion, (column, above, _) in MOMENTS.items():

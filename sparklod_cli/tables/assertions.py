@@ -1,4 +1,4 @@
-"""Assertions, `NAME SIGN VALUE` such as `nodes<=5M`, on tables of frames and reports on files; outcomes for tables."""
+"""Assertions, `NAME SIGN VALUE` such as `nodes<=5M`, about tables of frames and reports; their outcomes for tables."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NUMBER = re.compile(
 
 
 class BadAssertionError(SparklodError):
-    """An assertion cannot be understood, or not be answered."""
+    """An assertion cannot be parsed, or there are no values to check."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Assertion:
     Attributes:
         sign: one of `SIGNS`.
         bound: a number, or for == and != any value of JSON; a number for columns.
-        statistic: of a column, see `statistic`; empty for reports, and if every frame must hold by itself.
+        statistic: of a column, see `statistic`; empty for reports, and if every frame must satisfy the assertion.
     """
 
     text: str
@@ -52,7 +52,7 @@ class Assertion:
     statistic: str = ""
 
     def holds(self, value: Any) -> bool:
-        """Whether a value satisfies the assertion. Only numbers have an order; true is not 1."""
+        """Return whether a value satisfies the assertion. Only numbers have an order; true is not 1."""
         if self.sign in ("==", "!="):
             same = bool(value == self.bound) and isinstance(value, bool) == isinstance(self.bound, bool)
             return same == (self.sign == "==")
@@ -60,13 +60,13 @@ class Assertion:
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value can be compared by its size."""
+    """Return whether a value is a number other than NaN; true and false are not."""
     # Only NaN differs from itself; math.isnan fails on whole numbers beyond the range of floats.
     return isinstance(value, (int, float)) and not isinstance(value, bool) and value == value
 
 
 def parse_assertion(text: str, *, example: str) -> Assertion:
-    """Return an assertion about any name from `NAME SIGN VALUE`.
+    """Parse an assertion about any name, `NAME SIGN VALUE`, like the `example` that errors show.
 
     VALUE is a number, which may end in k, M, G, % or a unit of bytes (3MB, 3MiB); or true, false, null, or a text in
     double quotes, a list or an object as in JSON.
@@ -101,17 +101,17 @@ def _number(text: str, right: str) -> Number:
 
 
 def number_text(value: Number) -> str:
-    """Return a number as exact as a comparison needs it: "1,234,567", "0.2", "0.123457"."""
+    """Return a number with enough digits for comparisons: "1,234,567", "0.2", "0.123456789"."""
     return f"{int(value):,}" if float(value).is_integer() and abs(value) < 1e15 else f"{value:.9g}"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Whether an assertion holds.
+    """Result of checking an assertion.
 
     Attributes:
         value: the statistic; without one, the value of the worst frame.
-        failed, frames: frames that fail by themselves, and frames that have a value; `failed` is 0 for a statistic.
+        failed, frames: number of frames that fail, 0 for a statistic, and of frames that have a value.
         worst: row of the frame that fails by most, or that comes closest to failing; None for a count.
     """
 
@@ -141,10 +141,10 @@ class Outcome:
 
 
 def parse(text: str, columns: Sequence[Column]) -> Assertion:
-    """Return an assertion from `NAME[_STATISTIC] SIGN NUMBER`; a `BadAssertionError` suggests similar names.
+    """Parse an assertion about a numeric column, `NAME[_STATISTIC] SIGN NUMBER`; errors suggest similar names.
 
-    NAME is that of a numeric column, the longest one that fits: `pixel_scale_min<1` is about every cell of the column
-    pixel_scale_min, `pixel_scale_min_max<1` about the largest of them. NUMBER may end in k, M, G or %.
+    The longest matching column is meant: `pixel_scale_min<1` is about every cell of the column pixel_scale_min,
+    `pixel_scale_min_max<1` about the largest of them. NUMBER may end in k, M, G or %.
     """
     assertion = parse_assertion(text, example="churn_p95<0.2")
     left, kinds = assertion.name, {column.name: column.kind for column in columns}
@@ -162,6 +162,7 @@ def parse(text: str, columns: Sequence[Column]) -> Assertion:
 
 
 def _unknown(left: str, columns: Sequence[Column]) -> str:
+    """Return the error for the left side of an assertion that names no column, or no statistic of one."""
     numeric = [column.name for column in columns if column.kind is not str]
     stem, _, last = left.rpartition("_")
     name = stem if stem and is_statistic(last) else left
@@ -180,7 +181,7 @@ def check(
 
     Args:
         rows: of all frames; rows of single instances are left out.
-        empty: why all cells of a column may be empty, by the column's name, for the error.
+        empty: reasons for columns without values, by column, for the error.
 
     Raises:
         BadAssertionError: there is no frame, or all cells of a column are empty.
@@ -211,7 +212,7 @@ def _outcome(assertion: Assertion, rows: Sequence[Row], empty: Mapping[str, str]
 
 
 def _badness(assertion: Assertion, value: Number) -> Number:
-    """Larger for values that fail by more, or come closer to failing."""
+    """Return a rank of a value: larger if it fails by more, or comes closer to failing."""
     if assertion.sign in ("<", "<="):
         return value
     if assertion.sign in (">", ">="):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import io
 import json
 import math
@@ -29,8 +30,8 @@ class Column:
     Attributes:
         kind: type of the cells that are not empty: int, float or str.
         digits: format of a float (".6f": six decimals, ".6g": six significant digits); empty otherwise.
-        unit: as people read it; empty for a plain number or a text.
-        meaning: what the cells say, in one phrase.
+        unit: for display; empty for a plain number or a text.
+        meaning: a phrase that describes the cells.
     """
 
     name: str
@@ -51,7 +52,7 @@ class Column:
 #: The cells of a row, by the names of their columns.
 Row = dict[str, Cell]
 
-#: Which frame a row is of: the columns that every table with a row for each frame begins with.
+#: Columns that identify a frame; every table with a row for each frame begins with them.
 FRAME = (
     Column("frame", int, "", "", "number of the frame on the path, from 0; with `--every` some are left out"),
     Column("time_s", float, ".6f", "s", "time on the path"),
@@ -68,12 +69,12 @@ TYPES = {int: "integer", float: "number", str: "string"}
 #: Characters that make CSV quote a text (RFC 4180).
 QUOTED = ',"\r\n'
 
-#: First characters of texts that spreadsheets take for formulas, or skip before one.
+#: First characters of texts that spreadsheets take for formulas, and white space that they skip before one.
 FORMULAS = ("=", "+", "-", "@", "\t", "\r", "\n")
 
 
 def load_pyarrow() -> ModuleType:
-    """Import pyarrow."""
+    """Import pyarrow, or raise a `SparklodError` that says how to install it."""
     with optional_import("Parquet needs pyarrow", "parquet"):
         import pyarrow
         import pyarrow.parquet
@@ -123,10 +124,7 @@ def _dumped(value: dict[str, Any]) -> str:
 
 
 def _parquet(rows: Iterable[Row], columns: Sequence[Column]) -> Iterator[bytes]:
-    return _parquet_pieces(rows, columns, load_pyarrow())  # a missing pyarrow is an error at once, not at the first row
-
-
-def _parquet_pieces(rows: Iterable[Row], columns: Sequence[Column], pyarrow: ModuleType) -> Iterator[bytes]:
+    pyarrow = load_pyarrow()
     types = {int: pyarrow.int64(), float: pyarrow.float64(), str: pyarrow.string()}
     fields = [
         pyarrow.field(column.name, types[column.kind], metadata={"unit": column.unit, "description": column.meaning})
@@ -145,11 +143,10 @@ def _parquet_pieces(rows: Iterable[Row], columns: Sequence[Column], pyarrow: Mod
     yield file.getvalue()
 
 
-#: Formats of tables by name, which is the suffix too, and the functions that return the pieces of a file of rows with a
-#: cell for each column; the first is the default. CSV and JSON are made row by row, so that long paths take no memory.
-#: An empty text is written as an empty cell, since CSV cannot tell them apart; what UTF-8 cannot hold becomes "?". In
-#: CSV a ' is put before a text that a spreadsheet would take for a formula. Parquet raises a `SparklodError` at once
-#: where pyarrow is not installed; all raise `ValueError`, while the pieces are taken, where a number is not finite.
+#: Formats of tables by name, which is also the suffix, with functions that yield the bytes of a file with a cell for
+#: each row and column; the first format is the default. CSV and JSON are encoded row by row, so that long paths take no
+#: memory. An empty text becomes an empty cell, since CSV cannot tell them apart; lone surrogates become "?". CSV puts
+#: a ' before a text that a spreadsheet would take for a formula. Numbers that are not finite are a `ValueError`.
 FORMS: dict[str, Callable[[Iterable[Row], Sequence[Column]], Iterator[bytes]]] = {
     "csv": _csv,
     "json": _json,
@@ -166,8 +163,8 @@ class TableOutput:
     """Destination of a table.
 
     Attributes:
-        path: of its file; None for standard output, or for nowhere.
-        form: a key of `FORMS`; None for nowhere: rows are computed, but not written.
+        path: of its file; None for standard output, or without a `form`.
+        form: a key of `FORMS`; None to compute the rows without writing them.
     """
 
     path: Path | None
@@ -184,8 +181,7 @@ class TableOutput:
     def write(self, rows: Iterable[Row], *, passed: Filter | None = None) -> None:
         """Compute all rows and write each at once; `passed` filters the bytes on their way to standard output."""
         if self.form is None:
-            for _ in rows:
-                pass
+            collections.deque(rows, maxlen=0)
             return
         data: Iterable[bytes] = FORMS[self.form](iter(rows), self.columns)
         if self.path is None and passed is not None:
@@ -215,19 +211,19 @@ def is_statistic(name: str) -> bool:
 
 
 def statistic(name: str, values: Sequence[Number]) -> Number:
-    """Return a statistic of the numbers of a column, in the order of the frames; at least one, except for "count".
+    """Return one of `STATISTICS`, or a linearly interpolated percentile such as p95, of a column's numbers in order.
 
-    It is one of `STATISTICS`, or a percentile such as p95, interpolated linearly.
+    Only "count" takes an empty column.
     """
     if name in STATISTICS:
         return STATISTICS[name](values)
-    import numpy as np  # which --help does not need
+    import numpy as np  # --help does not need it
 
     return float(np.percentile(np.array(values, np.float64), int(name[1:])))
 
 
 def totals(rows: Iterable[Row]) -> list[Row]:
-    """Return the rows of all instances together, one a frame; all rows of a table without a column for instances."""
+    """Return the rows of all instances together, one per frame; all rows if there is no column for instances."""
     return [row for row in rows if row.get("instance", TOTAL) == TOTAL]
 
 
@@ -236,7 +232,7 @@ def numbers(rows: Iterable[Row], name: str) -> list[Number]:
     return [cell for row in rows if isinstance(cell := row[name], (int, float))]
 
 
-#: Rows that are shown of a table in a notebook, half from its beginning and half from its end.
+#: Maximum number of rows that a notebook shows, half from the beginning and half from the end of a table.
 SHOWN = 20
 
 
@@ -273,7 +269,7 @@ class Table(Sequence[Row]):
         """Return the cells of a column, None where one is empty.
 
         Raises:
-            KeyError: there is no such column; the text names those that there are.
+            KeyError: there is no such column; the message lists the columns.
         """
         names = [column.name for column in self.columns]
         if name not in names:

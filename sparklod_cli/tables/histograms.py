@@ -39,35 +39,29 @@ class Histogram:
     not_finite: int = 0
 
 
-def histogram(values: FloatArray, *, bins: int = 40, log: bool | None = None) -> Histogram:
-    """Return the histogram of (N,) numbers, finite or not; there is only one bin if all are the same.
+def histogram(values: FloatArray, *, bins: int = 40, linear: bool = False) -> Histogram:
+    """Return the histogram of (N,) numbers, finite or not; it has one bin if all are the same.
 
-    `log` uses bins of equal ratios; None does so for positive numbers that span more than `LOG_SPAN`. `ValueError` if
-    `bins` is less than 1, or `log` is set and a number is not positive.
+    Positive numbers that span more than `LOG_SPAN` get bins of equal ratios, unless it is `linear`.
     """
-    if bins < 1:
-        raise ValueError(f"{bins} bins")
     finite = values[np.isfinite(values)].astype(np.float64)
     not_finite = len(values) - len(finite)
     if not len(finite):
-        return Histogram(np.empty(0), np.empty(0, np.int64), bool(log), not_finite=not_finite)
+        return Histogram(np.empty(0), np.empty(0, np.int64), log=False, not_finite=not_finite)
     least, most = float(finite.min()), float(finite.max())
-    if log and least <= 0:
-        raise ValueError(f"{least:g} has no logarithm")
-    if log is None:
-        log = least > 0 and most > LOG_SPAN * least
+    log = not linear and least > 0 and most > LOG_SPAN * least
     if log:
         np.log(finite, out=finite)
     first, low, high, last = (float(end) for end in np.percentile(finite, [0, 0.5, 99.5, 100]))
     ends = (low, high) if high > low and last - first > FAR_SPAN * (high - low) else (first, last)
     if ends[1] - ends[0] <= 1e-12 * max(map(abs, ends)):
-        # A single value, in a bin one float wide on either side.
+        # A single value: its bin ends at the next floats on both sides.
         edges = np.array([np.nextafter(least, -np.inf), np.nextafter(most, np.inf)])
         return Histogram(edges, np.array([len(finite)]), log, not_finite=not_finite)
     counts, edges = np.histogram(finite, bins, ends)
     below, above = int(np.count_nonzero(finite < edges[0])), int(np.count_nonzero(finite > edges[-1]))
     if log:
-        edges = np.exp(edges)  # exp rounds, but the outermost edges are known exactly
+        edges = np.exp(edges)  # exp rounds; the outermost edges are set exactly
         edges[0], edges[-1] = edges[0] if below else least, edges[-1] if above else most
     return Histogram(edges, counts.astype(np.int64), log, below, above, not_finite)
 
@@ -75,7 +69,7 @@ def histogram(values: FloatArray, *, bins: int = 40, log: bool | None = None) ->
 def as_text(histogram: Histogram, *, width: int = 60, rows: int = 20) -> str:
     """Return a line for each bin, with its lower edge, count and bar, and lines for the numbers outside the bins.
 
-    Bins are joined where there are more than `rows`; the longest bar has `width` characters.
+    Bins are merged to at most `rows`; the longest bar has `width` characters.
     """
     lines: list[tuple[str, int, bool]] = []
     if len(histogram.counts):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sparklod_cli.cameras import sources
-from sparklod_cli.cameras.camera import DEFAULT_UP, Camera, Frame, Intrinsics, Settings, look_at
+from sparklod_cli.cameras.camera import Camera, Frame, Intrinsics, Settings, look_at
 from sparklod_cli.cameras.camera_files import read
 from sparklod_cli.cameras.camera_formats import Axes
 from sparklod_cli.cameras.framing import (
@@ -37,6 +37,7 @@ from sparklod_cli.model.splats import Splats
 from sparklod_cli.render.render_settings import RasterSettings
 from sparklod_cli.system.errors import CameraPathError, InvalidSplatsError
 from tests.cameras.known import FOCAL, HALF_TURN, KNOWN, LANDMARK, check_pose, pixel, read_fixture, read_json, text_file
+from tests.simulation.conftest import UP
 
 
 def own(settings: Settings | None = None, **root: Any) -> CameraPath:
@@ -308,7 +309,7 @@ def test_distances_of_a_dolly_have_one_ratio() -> None:
 
 
 def test_looking_along_up_still_makes_a_camera() -> None:
-    for up in (DEFAULT_UP, (0, 0, 0)):
+    for up in (UP, (0, 0, 0)):
         pose = look_at((0, 5, 0), (0, 0, 0), up)
         assert np.allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3))
         assert np.allclose(pose[:3, 2], (0, 1, 0))
@@ -323,7 +324,7 @@ KEYS = [
 
 
 def test_a_path_passes_its_keyframes_without_jumps() -> None:
-    frames = moved(KEYS, 200, DEFAULT_UP)
+    frames = moved(KEYS, 200, UP)
     seen = positions(frames)
     assert len(frames) == 1 + 200 * 6
     for key in KEYS:
@@ -342,8 +343,8 @@ def test_a_path_passes_its_keyframes_without_jumps() -> None:
 def test_keyframes_without_a_lens_keep_the_given_one() -> None:
     lens = Intrinsics((640, 480), (600, 610), (300, 200))
     keys = [Key(key.eye, key.target) for key in KEYS]
-    assert all(frame.lens == lens for frame in moved(keys, 5, DEFAULT_UP, lens))
-    mixed = moved([keys[0], KEYS[1]], 5, DEFAULT_UP)
+    assert all(frame.lens == lens for frame in moved(keys, 5, UP, lens))
+    mixed = moved([keys[0], KEYS[1]], 5, UP)
     assert mixed[0].lens.fov == pytest.approx(math.radians(60))
 
 
@@ -361,7 +362,7 @@ def test_keyframe_times_that_do_not_rise_or_are_far_apart_are_refused(
 ) -> None:
     keys = [Key(key.eye, key.target, time=time) for key, time in zip(KEYS, times, strict=False)]
     with pytest.raises(CameraPathError, match=said):
-        moved(keys, 30, DEFAULT_UP)
+        moved(keys, 30, UP)
 
 
 # Framing: cameras that have a scene in view

@@ -182,7 +182,7 @@ def test_parquet_has_types_and_units() -> None:
 def test_the_extra_that_brings_pyarrow_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(SparklodError, match=re.escape(install_hint("parquet"))) as caught:
-        FORMS["parquet"]([], COLUMNS)
+        list(FORMS["parquet"]([], COLUMNS))
     assert "\n" not in str(caught.value)
 
 
@@ -385,9 +385,9 @@ def test_every_number_is_counted_once(values: np.ndarray, bins: int) -> None:
 @given(ARRAYS)
 def test_bins_of_a_logarithmic_histogram_have_one_ratio(values: np.ndarray) -> None:
     values = np.abs(values) + np.float32(1e-30)
-    counted = histogram(values, log=True)
+    counted = histogram(values)
     check(counted, values)
-    if len(counted.counts) > 1:
+    if counted.log and len(counted.counts) > 1:
         ratios = counted.edges[1:] / counted.edges[:-1]
         assert np.allclose(ratios, ratios[0], rtol=1e-5)
 
@@ -403,7 +403,7 @@ def test_a_bin_has_its_lower_edge_and_the_last_one_both() -> None:
 def test_wide_spans_of_positive_numbers_have_bins_of_equal_ratios() -> None:
     values = np.logspace(-3, 1, 100).astype(np.float32)
     assert histogram(values).log
-    assert not histogram(values, log=False).log
+    assert not histogram(values, linear=True).log
     assert not histogram(values + 1).log
     assert not histogram(np.append(values, 0)).log
     assert np.allclose(histogram(values, bins=4).edges, [0.001, 0.01, 0.1, 1, 10])
@@ -434,13 +434,6 @@ def test_a_histogram_of_no_finite_number_has_no_bins(values: list[float]) -> Non
     counted = histogram(np.array(values, np.float32))
     assert len(counted.counts) == 0
     assert as_text(counted) == (f"not finite  {len(values)}" if values else "no numbers")
-
-
-def test_no_bins_and_logarithms_of_zero_are_errors() -> None:
-    with pytest.raises(ValueError, match="0 bins"):
-        histogram(np.ones(3, np.float32), bins=0)
-    with pytest.raises(ValueError, match="has no logarithm"):
-        histogram(np.array([0, 1], np.float32), log=True)
 
 
 def test_bars_of_text_are_as_long_as_their_counts() -> None:
