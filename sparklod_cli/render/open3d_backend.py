@@ -2,16 +2,16 @@
 
 Differences from the backend `numba`:
 
-- Opacity is at most 1: a merged splat of linear opacity A > 1 is drawn as an opaque one that is A ** (1 / 3) larger,
-  which has the same integral over space. `RasterSettings.profile` has no effect.
+- Opacity is at most 1: a merged splat of linear opacity A > 1 becomes an opaque splat that is A ** (1 / 3) larger and
+  has the same integral over space. `RasterSettings.profile` has no effect.
 - Splats are sorted by depth; `RasterSettings.sort` has no effect.
-- Colours are clamped to 1 before blending and have 8 bits, as does the picture. Alpha is computed from one picture on
+- Colours are clamped to 1 before blending and have 8 bits, as does the picture. Alpha is computed from a picture on
   black and one on white.
-- Quaternions have 8 bits, and a splat's centre on the picture may be off by 1/16 of a pixel.
-- The size of a splat on the picture is not limited; Spark limits it to 512 pixels.
+- Quaternions have 8 bits, and the centre of a splat in the picture may be off by 1/16 of a pixel.
+- The size of a splat in the picture is not limited; Spark limits it to 512 pixels.
 
-Without merged splats it agrees with `numba`, sorted by depth, to 50 dB and more; with many of them, to 20 to 35. It
-draws in pieces, see `PIECE`, and in software takes ten times as long or more.
+Without merged splats pictures agree with `numba`, sorted by depth, to 50 dB and more; with many, to 20 to 35 dB.
+Pictures are drawn in pieces, see `PIECE`, which takes ten times as long or more in software.
 """
 
 from __future__ import annotations
@@ -48,16 +48,13 @@ MOST_LOGIT = 12.0
 #: Largest scale passed to Open3D, which stores float16: at most 65504, and exact to 1/1024 down to 6e-5.
 MOST_SCALE = 2.0**12
 
-#: Angle in radians by which the picture is rotated, too small to be visible. Open3D divides by 0 if a splat is wider
-#: than high and exactly axis-aligned, as happens in synthetic scenes, and draws black tiles.
+#: Angle in radians by which the picture is rotated, too small to be visible. Open3D divides by 0 for a splat that is
+#: wider than high and exactly axis-aligned, as in synthetic scenes, and draws black tiles.
 ASKEW = 1e-5
 
 
 def draw(shaded: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
-    """Draw the picture of a camera: (height, width, 4) float32 red, green, blue (premultiplied) and alpha, 0..1.
-
-    `BackendError` if Open3D is not installed, cannot draw here, or has crashed.
-    """
+    """Draw the picture of a camera, see `rasterizer.draw`; `BackendError` if Open3D is missing, fails or crashes."""
     global _child
     image = np.zeros((camera.height, camera.width, 4), np.float32)
     with _LOCK:
@@ -75,9 +72,9 @@ def draw(shaded: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
 def pieces(
     shaded: ShadedSplats, camera: Camera, raster: RasterSettings, most_entries: int
 ) -> Iterator[tuple[tuple[int, int], dict[str, Any], Array]]:
-    """Return the pieces that Open3D draws: left and top of each, the request, and the splats that touch it.
+    """Yield the pieces of a picture: left and top, the request to Open3D, and the splats that touch the piece.
 
-    The splats are those that Spark would draw, relative to the camera.
+    Splats that Spark would not draw are left out; positions are relative to the camera.
     """
     to_camera = (camera.camera_to_world[:3, :3] @ np.diag([1.0, -1.0, -1.0])).T
     away = shaded.center - camera.position  # float64, however far out the camera is
@@ -94,7 +91,7 @@ def pieces(
     scale = shaded.scale[index] * np.cbrt(np.maximum(opacity, 1))[:, None]
     opacity = np.clip(opacity, None, 1 - 1e-7)
     unit = MOST_SCALE / max(float(scale.max(initial=0)), 1e-30)
-    quat_wxyz = shaded.quat_xyzw[index][:, [3, 0, 1, 2]]
+    quat_wxyz = np.roll(shaded.quat_xyzw[index], 1, axis=1)
     splats = np.empty((len(index), COLUMNS), np.float32)
     splats[:, :3] = away[index] * unit
     splats[:, 3:6] = scale * unit
@@ -103,7 +100,7 @@ def pieces(
     splats[:, 10] = np.minimum(np.log(opacity / (1 - opacity)), MOST_LOGIT)
     splats[:, 11:] = (shaded.rgb[index] - 0.5) / SH_C0
 
-    # An upper bound of the radius of each splat, in pixels.
+    # Upper bounds of the radii of splats, in pixels.
     slope = np.einsum("ij,ij->i", at, at) / at[:, 2] ** 2
     variance = (scale.max(axis=1) * max(camera.focal) / at[:, 2]) ** 2 * slope + BLUR
     half = MAX_STD_DEV * np.sqrt(variance)[:, None] + 2
@@ -125,9 +122,10 @@ def pieces(
 
 
 def _split(camera: Camera, low: Array, high: Array, most: int) -> Iterator[tuple[Square, NDArray[np.intp], int]]:
-    """Yield squares that cover the splats of a picture: each with its splats, and its pairs of splat and tile.
+    """Yield squares that cover the splats of a picture, with their splats and numbers of pairs of splat and tile.
 
-    `low` and `high`, (N, 2), are corners of boxes around splats, pixels. A square of several tiles has at most `most`.
+    `low` and `high`, (N, 2), are corners of boxes around splats, pixels. Squares with more than `most` pairs are
+    divided, down to a tile.
     """
     squares = [(x, y, PIECE) for y in range(0, camera.height, PIECE) for x in range(0, camera.width, PIECE)]
     waiting = [(square, np.arange(len(low))) for square in reversed(squares)]
@@ -149,13 +147,11 @@ def _split(camera: Camera, low: Array, high: Array, most: int) -> Iterator[tuple
 _LOCK = threading.Lock()
 _child: Child | None = None
 
-
 #: Time limits in seconds for starting the process, and for drawing a piece.
 START_LIMIT, DRAW_LIMIT = 180.0, 300.0
 
-#: Maximum number of pairs of splat and tile per request: the capacity of Open3D, and a limit for software rendering by
-#: an old Mesa. That of Debian 12, 22.3.6, sorts more than about 100,000 incorrectly, so that tiles are missing; 25.0.7
-#: does not.
+#: Most pairs of splat and tile per request: the capacity of Open3D, and a limit for software rendering by an old Mesa.
+#: Version 22.3.6 of Debian 12 sorts more than about 100,000 incorrectly, so that tiles are missing; 25.0.7 does not.
 MOST_ENTRIES, MOST_ENTRIES_OF_OLD_MESA, NEW_MESA = 1 << 25, 1 << 15, 25
 
 
@@ -165,10 +161,13 @@ def command() -> list[str]:
 
 
 class Child:
-    """A process in which Open3D draws, until this one ends; raises `BackendError` if it cannot draw here."""
+    """A process in which Open3D draws until this process ends; `BackendError` if it cannot draw here.
+
+    `most_entries` is the maximum number of pairs of splat and tile per request.
+    """
 
     def __init__(self) -> None:
-        # A file instead of a pipe, which would have to be read while the child writes.
+        # A pipe would have to be read while the child writes.
         self._folder = tempfile.TemporaryDirectory(prefix="sparklod-", ignore_cleanup_errors=True)
         self._log = Path(self._folder.name, "log")
         try:
@@ -179,15 +178,14 @@ class Child:
             raise BackendError(f"the process for Open3D does not start: {error}") from None
         atexit.register(self.close)
         self._answer(START_LIMIT, hint=f" (on Debian and Ubuntu: apt install {PACKAGES})")
-        mesa = re.search(r"llvmpipe Mesa (\d+)", self._words())
-        #: Maximum number of pairs of splat and tile per request, see `Painter.draw`.
+        mesa = re.search(r"llvmpipe Mesa (\d+)", self._messages())
         self.most_entries = MOST_ENTRIES_OF_OLD_MESA if mesa and int(mesa[1]) < NEW_MESA else MOST_ENTRIES
 
     def alive(self) -> bool:
         return self._process.poll() is None
 
     def ask(self, request: dict[str, Any], splats: Array) -> Array:
-        """Draw pictures as `Painter.draw`; raise `BackendError` if Open3D has crashed, takes too long or fails."""
+        """Draw pictures, see `Painter.draw`; `BackendError` if Open3D crashes, takes too long or fails."""
         pictures = self._answer(DRAW_LIMIT, request, splats)
         assert pictures is not None
         return pictures
@@ -198,7 +196,7 @@ class Child:
         assert self._process.stdin is not None and self._process.stdout is not None
         too_late = threading.Event()
 
-        def stop() -> None:  # ends the wait below on every system
+        def stop() -> None:  # which ends the wait below on every system
             too_late.set()
             self._process.kill()
 
@@ -212,8 +210,8 @@ class Child:
         except (EOFError, OSError):
             if too_late.is_set():
                 raise self._error(f"Open3D has not answered for {limit:g} seconds") from None
-            raise self._error(f"Open3D has crashed: {self._last_words()}{hint}") from None
-        except BaseException:  # the rest of this answer would be read as the next one
+            raise self._error(f"Open3D has crashed: {self._last_message()}{hint}") from None
+        except BaseException:  # the rest of this answer must not be read as the next one
             self.close()
             raise
         finally:
@@ -226,13 +224,13 @@ class Child:
         self.close()
         return BackendError(text)
 
-    def _words(self) -> str:
+    def _messages(self) -> str:
         return re.sub(r"\x1b\[[0-9;]*m", "", self._log.read_text("utf-8", "replace"))
 
-    def _last_words(self) -> str:
+    def _last_message(self) -> str:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(10)
-        lines = [line.strip() for line in self._words().splitlines() if line.strip()]
+        lines = [line.strip() for line in self._messages().splitlines() if line.strip()]
         return lines[-1] if lines else f"exit code {self._process.returncode}"
 
     def close(self) -> None:

@@ -1,13 +1,12 @@
 """Draws splats with Open3D in a separate process, because Open3D ends its process when it fails.
 
-`process` starts it and keeps it running. It sends a message when it has started, and one for each request on its
-standard input; it exits when that is closed. A message is a line of JSON and, if its "array" is not null, the bytes of
-an array.
+The process sends a message when it has started, and an answer to each request on its standard input; it exits when that
+is closed. A message is a line of JSON and, if its "array" is not null, the bytes of an array.
 
-The splats of Open3D 0.20, from its sources (`GaussianSplatDataPacking.cpp`, and the shaders `gaussian_*.comp` in
-its package): linear scales, quaternions w x y z, opacity as a logit, colour as the first spherical harmonic. It stores
-scales and colours as float16, and quaternions as bytes. Its camera is OpenCV's; the upper left corner of the upper left
-pixel is at 0, 0. Splats are blended over the background as they are, without tone mapping.
+Splats of Open3D 0.20, from its sources (`GaussianSplatDataPacking.cpp`, and the shaders `gaussian_*.comp` in its
+package), have linear scales, quaternions w x y z, opacity as a logit, and colour as the first spherical harmonic. It
+stores scales and colours as float16, and quaternions as bytes. Its camera is OpenCV's, with the upper left corner of
+the picture at 0, 0. It blends splats over the background without tone mapping.
 """
 
 from __future__ import annotations
@@ -27,19 +26,18 @@ from ..system.machine import pip_install
 #: Columns of the splats of a request: centre, scale, quaternion w x y z, logit of opacity, first spherical harmonics.
 COLUMNS = 14
 
-#: Sides in pixels of a tile, by which Open3D bins splats, and of the largest picture requested from it, which is small
-#: because Open3D stores screen positions as float16. Pictures are squares of 2 ** n tiles, because otherwise a barrier
-#: is missing in Open3D; and of at most 256 tiles, because it drops splats that touch more.
+#: Sides in pixels of a tile, by which Open3D bins splats, and of the largest picture, which is small because Open3D
+#: stores screen positions as float16. Pictures are squares of 2 ** n tiles, because Open3D lacks a barrier otherwise,
+#: and of at most 256 tiles, because it drops splats that touch more.
 TILE, PIECE = 16, 256
 
-#: Open3D allocates this many tiles per splat, and drops further ones. Its material has a setting for this, which 0.20
-#: ignores off screen, as it ignores the limit of 256.
+#: Tiles that Open3D allocates per splat; it drops further ones. Version 0.20 ignores the setting of its material.
 TILES_A_SPLAT = 32
 
-#: An invisible splat: it is at the position of the camera.
+#: An invisible splat, at the position of the camera.
 NOWHERE = np.array([0, 0, 0, 1, 1, 1, 1, 0, 0, 0, 9, 0, 0, 0], np.float32)
 
-#: The first version of Open3D that draws splats.
+#: First version of Open3D that draws splats.
 VERSION = "0.20"
 
 #: Words in Open3D's warning, printed once, that it has dropped splats.
@@ -52,8 +50,8 @@ Array = NDArray[Any]
 
 
 def send(file: IO[bytes], message: dict[str, Any], array: Array | None = None) -> None:
-    """Write a message and, optionally, an array."""
-    # Not as .npy, which requires a seekable file.
+    """Write a message and an optional array."""
+    # .npy would need a seekable file.
     about = None if array is None else {"type": array.dtype.str, "shape": array.shape}
     file.write(json.dumps({**message, "array": about}).encode() + b"\n")
     if array is not None:
@@ -76,10 +74,9 @@ def receive(file: IO[bytes]) -> tuple[dict[str, Any], Array | None]:
 
 
 class _Log(io.TextIOBase):
-    """Standard output of Python in this process, which receives Open3D's messages."""
+    """Standard output of Python in this process, with Open3D's messages."""
 
-    def __init__(self) -> None:
-        self.text = ""
+    text = ""
 
     def write(self, text: str) -> int:
         self.text += text
@@ -88,7 +85,7 @@ class _Log(io.TextIOBase):
 
 
 class Painter:
-    """Open3D's renderer; raises a `RuntimeError` that says why, if it cannot draw splats here."""
+    """Open3D's renderer; `RuntimeError`, with the reason, if it cannot draw splats here."""
 
     def __init__(self, log: _Log) -> None:
         self._log = log
@@ -101,22 +98,19 @@ class Painter:
             ) from None
         except (ImportError, OSError) as error:
             reason = " ".join(str(error).split())
-            raise RuntimeError(
-                f"Open3D does not load: {reason} (on Debian and Ubuntu: apt install {PACKAGES})"
-            ) from None
+            advice = f"on Debian and Ubuntu: apt install {PACKAGES}"
+            raise RuntimeError(f"Open3D does not load: {reason} ({advice})") from None
         self._open3d = open3d
         self._material = open3d.visualization.rendering.MaterialRecord()
         if not hasattr(self._material, "gaussian_splat_antialias"):
-            raise RuntimeError(
-                f"Open3D {open3d.__version__} cannot draw splats:"
-                f" {pip_install(f'open3d>={VERSION}', options=['--upgrade'])}"
-            )
+            upgrade = pip_install(f"open3d>={VERSION}", options=["--upgrade"])
+            raise RuntimeError(f"Open3D {open3d.__version__} cannot draw splats: {upgrade}")
         self._material.shader = "gaussianSplat"
         self._material.gaussian_splat_sh_degree = 0
         self._material.gaussian_splat_antialias = True
 
     def probe(self) -> None:
-        """Draw a splat; `RuntimeError` if it is missing: without a Vulkan device Open3D draws nothing, silently."""
+        """Draw a splat, because Open3D silently draws nothing without a Vulkan device; then raise `RuntimeError`."""
         splat = np.array([[0.0, 0.0, 1.0, 0.2, 0.2, 0.2, 1.0, 0.0, 0.0, 0.0, 9.0, -1.7, 1.7, -1.7]], np.float32)
         request = {
             "side": 32,
@@ -133,12 +127,12 @@ class Painter:
             )
 
     def draw(self, request: dict[str, Any], splats: Array) -> Array:
-        """Return (2, side, side, 3) uint8: the picture on black, and on white; `RuntimeError` if Open3D dropped splats.
+        """Return (2, side, side, 3) uint8, the picture on black and on white; `RuntimeError` if Open3D drops splats.
 
         Args:
             request: "side" of the picture; "intrinsic", (3, 3); "rotation", (3, 3) world to camera, with y down,
                 looking along z from the origin; "range", near and far distance; "entries", an upper bound of the number
-                of pairs of a splat and a tile of 16 x 16 pixels.
+                of pairs of a splat and a tile that it touches.
             splats: (N, COLUMNS) float32.
         """
         side = request["side"]
@@ -152,7 +146,7 @@ class Painter:
         intrinsic, extrinsic = np.array(request["intrinsic"]), np.eye(4)
         extrinsic[:3, :3] = request["rotation"]
         renderer.setup_camera(intrinsic, extrinsic, side, side)
-        # Again, because setup_camera chooses near and far from the bounding boxes in the scene.
+        # Repeated, because setup_camera chooses near and far from the bounding boxes in the scene.
         scene.camera.set_projection(intrinsic, *request["range"], side, side)
         pictures = []
         for background in (0.0, 1.0):
@@ -171,18 +165,16 @@ class Painter:
         return self._renderers[side]
 
     def _cloud(self, splats: Array) -> Any:
-        cloud = self._open3d.t.geometry.PointCloud(self._tensor(splats[:, :3]))
-        for name, first, end in (("scale", 3, 6), ("rot", 6, 10), ("opacity", 10, 11), ("f_dc", 11, 14)):
-            cloud.point[name] = self._tensor(splats[:, first:end])
+        places = {"scale": (3, 6), "rot": (6, 10), "opacity": (10, 11), "f_dc": (11, 14)}
+        cloud = self._open3d.t.geometry.PointCloud(self._open3d.core.Tensor(splats[:, :3].copy()))
+        for name, (first, end) in places.items():
+            cloud.point[name] = self._open3d.core.Tensor(splats[:, first:end].copy())
         return cloud
-
-    def _tensor(self, columns: Array) -> Any:
-        return self._open3d.core.Tensor(np.ascontiguousarray(columns))
 
 
 def main() -> None:
     """Answer requests until standard input is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # handled by the parent, which then closes the input
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and closes the input
     answers, requests = os.fdopen(os.dup(1), "wb"), sys.stdin.buffer
     os.dup2(2, 1)  # libraries print to descriptor 1
     sys.stdout = log = _Log()
@@ -205,8 +197,7 @@ def main() -> None:
                 send(answers, {"error": " ".join(str(error).split())})
             else:
                 send(answers, {}, pictures)
-    # Open3D's destructors may crash, and there is nothing left to write.
-    os._exit(0)
+    os._exit(0)  # without Open3D's destructors, which may crash
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
-"""OpenGL without a window: a moderngl context over libOSMesa or, where that is missing, over EGL.
+"""OpenGL without a window: a moderngl context over libOSMesa or, if that is missing, over EGL.
 
-Run as a module with the name of one of the two, it tests by drawing whether that works here. This needs a separate
-process, because a broken driver does not raise but ends the process.
+Run as a module with the name of a library, it tests the library by drawing. A broken driver ends this separate process.
 """
 
 from __future__ import annotations
@@ -9,22 +8,23 @@ from __future__ import annotations
 import ctypes
 import ctypes.util
 import functools
+import struct
 import subprocess
 import sys
 from typing import Any
 
 from ..system.python_process import module_command
 
-#: OpenGL version that the shaders need: 4.2 introduced unpackHalf2x16.
+#: OpenGL version of the shaders: 4.2 introduced unpackHalf2x16.
 VERSION = 420
 
-#: Libraries that can provide a context, in the order in which they are tried, and their Debian and Ubuntu packages.
+#: Libraries for a context, in order of preference, and their Debian and Ubuntu packages.
 PACKAGES = {"osmesa": "libosmesa6", "egl": "libegl1 libgl1 libgl1-mesa-dri"}
 
-#: File names of the library in its versions; Mesa 25.0 is the last release with it.
+#: File names of libOSMesa; Mesa 25.0 is the last release with it.
 OSMESA_NAMES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 
-#: Time limit in seconds of the process that tests a context; Mesa compiles its first shaders in well under one.
+#: Time limit in seconds for testing a context; Mesa compiles its first shaders in well under one.
 PATIENCE = 60
 
 # GL/osmesa.h
@@ -34,14 +34,14 @@ _RGBA, _UNSIGNED_BYTE = 0x1908, 0x1401
 
 
 class NoContextError(Exception):
-    """No context can be created; the message says why."""
+    """No context can be created, for the reason in the message."""
 
 
 class OSMesa:
     """A context of libOSMesa for moderngl, which requires the method `load_opengl_function`.
 
-    It is current on the thread that created it. Its default framebuffer is 1 x 1 pixels and never read; pictures are
-    drawn to framebuffer objects.
+    The context is current on the thread that created it. Pictures are drawn to framebuffer objects, not to its default
+    framebuffer of 1 x 1 pixels.
     """
 
     def __init__(self) -> None:
@@ -62,14 +62,14 @@ class OSMesa:
         attributes += [_MAJOR_VERSION, VERSION // 100, _MINOR_VERSION, VERSION // 10 % 10, 0]
         create = self._library.OSMesaCreateContextAttribs
         self._context = ctypes.c_void_p(create((ctypes.c_int * len(attributes))(*attributes), ctypes.c_void_p()))
-        self._pixel = (ctypes.c_ubyte * 4)()  # the library writes here as long as the context is current
+        self._pixel = (ctypes.c_ubyte * 4)()  # written by the library while the context is current
         if not self._context:
             raise NoContextError(f"this libOSMesa has no OpenGL {VERSION // 100}.{VERSION // 10 % 10}")
         if not self._library.OSMesaMakeCurrent(self._context, self._pixel, _UNSIGNED_BYTE, 1, 1):
             raise NoContextError("libOSMesa does not make its context current")
 
     def load_opengl_function(self, name: str) -> int:
-        """Return the address of an OpenGL function; 0 if there is none of that name."""
+        """Return the address of an OpenGL function, or 0."""
         return self._library.OSMesaGetProcAddress(name.encode()) or 0
 
     def release(self) -> None:
@@ -79,9 +79,9 @@ class OSMesa:
 
 
 def create(kind: str) -> Any:
-    """Return a moderngl.Context over one of `PACKAGES`, current on this thread; `NoContextError` if that fails.
+    """Create a moderngl.Context over one of `PACKAGES`, current on this thread; `NoContextError` if that fails.
 
-    A broken driver may end the process instead, see `probe`.
+    `probe` first, because a broken driver may end the process.
     """
     try:
         import moderngl
@@ -90,13 +90,12 @@ def create(kind: str) -> Any:
         if kind == "osmesa":
             options = {"context": OSMesa()}
         else:
-            # glcontext looks for file names that only development packages have; with glvnd either library has the
-            # functions.
+            # glcontext's default file names are those of development packages; with glvnd either library will do.
             libgl = ctypes.util.find_library("GL") or ctypes.util.find_library("OpenGL") or "libGL.so.1"
             libegl = ctypes.util.find_library("EGL") or "libEGL.so.1"
             options = {"backend": "egl", "libgl": libgl, "libegl": libegl, "standalone": True}
         context = moderngl.create_context(require=VERSION, **options)
-        # Python frees objects on any thread at any time; OpenGL objects must be freed on this thread, by `gc`.
+        # OpenGL objects must be freed on this thread, by `gc`; Python frees objects on any thread.
         context.gc_mode = "context_gc"
         return context
     except NoContextError:
@@ -107,7 +106,7 @@ def create(kind: str) -> Any:
 
 @functools.cache
 def probe(kind: str) -> str:
-    """Test a context in a separate process; return why it does not work here, empty if it does."""
+    """Test a context in a separate process; return the reason why it does not work, or an empty text."""
     command = module_command(__name__, kind)
     try:
         child = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
@@ -134,9 +133,7 @@ void main() { color = vec4(0.25, 0.5, 2.0, 1.0); }
 
 
 def _try(kind: str) -> None:
-    """Draw a triangle to a float texture and check the result."""
-    import struct
-
+    """Draw a triangle to a float texture, and check the result."""
     import moderngl
 
     context = create(kind)
