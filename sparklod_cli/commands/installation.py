@@ -251,8 +251,7 @@ def _open3d() -> Iterator[Check]:
         yield Check("Open3D", "note", "not tried, since it is not installed", install_hint("render", package="open3d"))
         return
     try:
-        from ..render.open3d_backend import command
-        from ..render.open3d_process import PACKAGES
+        from ..render.open3d_backend import PACKAGES, command
     except ImportError as absent:  # numpy
         yield Check("Open3D", "note", f"not tried ({absent})", install_hint())
         return

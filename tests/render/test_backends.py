@@ -24,7 +24,7 @@ from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.falloff import MIN_ALPHA
 from sparklod_cli.render import open3d_backend as backend
 from sparklod_cli.render import opengl, osmesa, rasterizer
-from sparklod_cli.render.open3d_process import PIECE
+from sparklod_cli.render.open3d_backend import PIECE
 from sparklod_cli.render.rasterizer import Image, ShadedSplats, shade
 from sparklod_cli.render.render_settings import PROFILES, SORTINGS, SORTS, RasterSettings
 from sparklod_cli.system.errors import BackendError, SparklodError
@@ -491,7 +491,7 @@ def test_open3d_draws_nothing_where_no_splat_is() -> None:
 PREAMBLE = """
 import os, sys, time
 import numpy as np
-from sparklod_cli.render.open3d_process import send, receive
+from sparklod_cli.render.open3d_backend import send, receive
 inn, out = sys.stdin.buffer, sys.stdout.buffer
 """
 
@@ -527,7 +527,7 @@ from types import SimpleNamespace as Space
 rendering = Space(MaterialRecord=lambda: Space())
 sys.modules["open3d"] = Space(__version__="0.19.0", visualization=Space(rendering=rendering))
 """
-RUNS = "from sparklod_cli.render.open3d_process import main; main()"
+RUNS = "from sparklod_cli.render.open3d_backend import main; main()"
 
 
 @pytest.mark.parametrize(
