@@ -38,21 +38,6 @@ def test_a_benchmark_prints_its_help(
     assert capsys.readouterr().out.startswith("usage: ")
 
 
-@pytest.mark.parametrize(("workers", "seconds"), [(1, 16), (2, 10), (3, 8), (64, 8)])
-def test_the_model_of_workers_keeps_to_what_tasks_need(workers: int, seconds: float) -> None:
-    """Three parts, then two blocks that need all of them, and a join that needs both."""
-    spec = importlib.util.spec_from_file_location("scale_report", ROOT / "benchmarks" / "scale_report.py")
-    assert spec is not None
-    assert spec.loader is not None
-    report = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(report)
-    parts = [{"name": f"part/{number}", "needs": [], "seconds": 2} for number in range(3)]
-    needs = [part["name"] for part in parts]
-    blocks = [{"name": f"block/{number}", "needs": needs, "seconds": 4} for number in range(2)]
-    join = {"name": "join", "needs": ["block/0", "block/1", "unknown"], "seconds": 2}
-    assert report.makespan([*parts, *blocks, join], workers) == seconds
-
-
 @pytest.fixture
 def benchmark_module(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Imports a module of the benchmarks by its name."""
@@ -107,19 +92,6 @@ def test_tables_of_fidelity_say_what_was_measured(benchmark_module: Any) -> None
     assert "| text-wall.ply | our quality | 4.00 / 5.00 |" in tables["popping"]
 
 
-def test_tables_of_fidelity_go_between_their_marks(benchmark_module: Any, tmp_path: Path) -> None:
-    report = benchmark_module("fidelity_report")
-    page = tmp_path / "page.md"
-    page.write_text("before\n<!-- table: ssim -->\nold\n<!-- end of table -->\nafter\n")
-    other = tmp_path / "other.md"
-    other.write_text("no table\n")
-    report.put_into(tmp_path, {"ssim": "| new |"})
-    assert other.read_text() == "no table\n"
-    assert page.read_text() == "before\n<!-- table: ssim -->\n| new |\n<!-- end of table -->\nafter\n"
-    with pytest.raises(SystemExit, match="no page with a place for the table 'edges'"):
-        report.put_into(tmp_path, {"edges": "| new |"})
-
-
 def test_the_pages_about_fidelity_have_a_place_for_every_table(benchmark_module: Any, tmp_path: Path) -> None:
     report = benchmark_module("fidelity_report")
     tables = report.tables(record("around", "near", "orbit", "around SH"))
@@ -128,14 +100,6 @@ def test_the_pages_about_fidelity_have_a_place_for_every_table(benchmark_module:
     report.put_into(docs, tables | {"blocks": "| blocks |", "rounding": "| rounding |"})
     text = "".join(page.read_text() for page in docs.glob("*.md"))
     assert all(table in text for table in tables.values())
-
-
-def test_records_of_several_runs_add_up(benchmark_module: Any, tmp_path: Path) -> None:
-    for name, cameras in (("a.json", ("around", "orbit")), ("b.json", ("near",))):
-        (tmp_path / name).write_text(json.dumps(record(*cameras)))
-    whole = benchmark_module("fidelity_report").merged([tmp_path / "a.json", tmp_path / "b.json"])
-    assert set(whole["scenes"]["text-wall.ply"]["quality"]["views"]) == {"around", "orbit", "near"}
-    assert whole["cameras"] == ["around", "orbit", "near"]
 
 
 def test_the_scene_of_thin_things_is_the_same_for_a_seed_and_thin(benchmark_module: Any) -> None:
@@ -219,17 +183,3 @@ def _copied(folder: Path) -> Path:
     for page in (ROOT / "docs").glob("*.md"):
         shutil.copy(page, docs)
     return docs
-
-
-def test_simplifiers_that_are_missing_are_skipped_with_a_reason(
-    benchmark_module: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench = benchmark_module("bench_simplify")
-    assert bench.why_skipped("quality") is None
-    monkeypatch.delenv("NANOGS_DIR", raising=False)
-    assert bench.why_skipped("nanogs") == "NANOGS_DIR is not set; it names a folder with simplification.py"
-    monkeypatch.setenv("NANOGS_DIR", str(tmp_path))
-    assert bench.why_skipped("nanogs") == "NANOGS_DIR has no simplification.py"
-    monkeypatch.setenv("ENGINES_DIR", str(tmp_path))
-    command = bench.set_command("decimate", Path("a.ply"), Path("b.ply"), "10%")
-    assert list(map(str, command[2:])) == ["-q", "-w", "-g", "cpu", "a.ply", "--decimate", "10%", "b.ply"]

@@ -49,20 +49,6 @@ def test_a_table_has_what_was_measured_and_how_fast_the_machine_was(modules: Any
     assert "Left out: there is no scene x.ply." in told
 
 
-def gradients(modules: Any, picture: float, backward: float) -> Any:
-    """Figures of gradients, of 20,000 splats."""
-    row = modules("rows").Row({"splats": 20_000}, {"picture_cpu_s": [picture], "gradients_cpu_s": [backward]})
-    return {"gradients": measured(modules, [row])}
-
-
-def test_a_missed_goal_is_said_missed_and_by_how_much(modules: Any) -> None:
-    told = modules("page").page("{{ goals gradients }}", gradients(modules, 0.010, 0.030))
-    assert "| gradients take at most 3 times as long as the picture | met: 3.0 |" in told
-    assert "| gradients of 20,000 splats within 25 ms | **missed** by 20 %: 30.0 ms |" in told
-    told = modules("page").page("{{ goals gradients }}", gradients(modules, 0.010, 0.02505))
-    assert "**missed** by 0.2 %: 25.1 ms" in told or "**missed** by 0.2 %: 25.0 ms" in told
-
-
 def test_a_goal_of_several_rows_is_met_only_if_all_keep_to_it(modules: Any) -> None:
     goals, row = modules("goals"), modules("rows").Row
     goal = goals.Goal("a", "b", "c", lambda each: each.value("x_s"), least=2, name=("scene",), form="{:.1f}")
@@ -110,13 +96,6 @@ def test_figures_that_fell_behind_by_more_than_noise_are_reported(
     assert all(str(each).startswith("a: x_s ") for each in found)
 
 
-def test_memory_does_not_depend_on_how_fast_the_machine_is(modules: Any) -> None:
-    row, table = modules("rows").Row, modules("rows").Table(**TABLES)
-    old = measured(modules, [row({"scene": "a"}, {"peak_bytes": [100, 101]})])
-    new = measured(modules, [row({"scene": "a"}, {"peak_bytes": [120, 121]})], 0.1)
-    assert [each.name for each in modules("behind").behind(table, old, new)] == ["peak_bytes"]
-
-
 def test_figures_are_written_and_read_again(modules: Any, tmp_path: Path) -> None:
     store, file = modules("figures"), tmp_path / "figures.json"
     rows = [modules("rows").Row({"scene": "a", "splats": 3}, {"x_s": [0.1234567, 2e9], "y_s": []})]
@@ -139,18 +118,6 @@ def test_a_process_is_measured_from_outside(modules: Any, tmp_path: Path) -> Non
     with pytest.raises(process.CommandError, match="ValueError: no"):
         process.run([sys.executable, "-c", "raise ValueError('no')"])
     assert process.run([sys.executable, "-c", "raise SystemExit(3)"], codes=(0, 3)).output == ""
-
-
-def test_jobs_take_turns_and_their_first_run_does_not_count(modules: Any) -> None:
-    order: list[str] = []
-
-    def job(name: str) -> Any:
-        return lambda: (order.append(name), len(order))[1]
-
-    assert modules("process").in_turn(2, [job("a"), job("b")]) == [[3, 5], [4, 6]]
-    assert order == ["a", "b"] * 3
-    order.clear()
-    assert modules("process").in_turn(1, [job("a"), job("b")], first=False) == [[1], [2]]
 
 
 def test_a_section_that_fails_is_told_and_the_others_go_on(

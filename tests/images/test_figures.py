@@ -324,13 +324,6 @@ def test_the_level_of_a_step_is_the_smallest_not_below_it(size: float) -> None:
     assert 1.5 ** (level - 1) * (1 - 1e-6) <= size <= 1.5**level * (1 + 1e-6)
 
 
-def test_cells_are_the_corners_of_occupied_cubes_and_a_box_has_twelve_edges() -> None:
-    center = np.array([[0.1, 0.1, -0.1], [0.4, 0.3, -0.4], [0.6, 0.1, -0.1]], np.float32)
-    assert pyvista_scene.cells(center, 0.5).tolist() == [[0, 0, -0.5], [0.5, 0, -0.5]]
-    lines = pyvista_scene.box_lines(np.array([[1.0, 2, 3]]), np.array([[2.0, 4, 6]])).reshape(12, 2, 3)
-    assert sorted(np.abs(np.diff(lines, axis=1)).sum(axis=(1, 2)).tolist()) == [1] * 4 + [2] * 4 + [3] * 4
-
-
 @pytest.mark.parametrize("aspect", [0.5, 1.6, 3])
 @pytest.mark.parametrize("extent", [(1.0, 1, 1), (100, 1, 1), (1, 50, 0.1), (1e-6, 1e-6, 1e-6)])
 def test_a_viewpoint_sees_all_within_its_frame(aspect: float, extent: tuple[float, float, float]) -> None:
@@ -387,25 +380,20 @@ def test_every_level_has_a_colour_and_a_mark() -> None:
     assert len(np.unique(rgb, axis=0)) == 1
 
 
-def test_few_levels_at_the_ends_do_not_take_colors_from_the_others() -> None:
+def test_outliers_take_no_colors_from_other_values_and_opacities_above_one_are_lod_opacities() -> None:
     depth = np.concatenate([np.zeros(2), np.repeat([5, 6, 7], 300), np.full(3, 60)]).astype(np.int32)
-    coloring, _ = color_by("level", random_splats(len(depth)), np.arange(len(depth)), depth)
-    assert [text for _, text in coloring.marks] == ["5 or less", "6", "7 or more"]
-
-
-def test_opacities_above_one_are_labelled_as_lod_opacity() -> None:
-    splats = random_splats(1000)
-    assert color_by("opacity", splats, np.arange(1000), None)[0].title == "opacity"
+    splats, every = random_splats(len(depth)), np.arange(len(depth))
+    levels = color_by("level", splats, every, depth)[0]
+    assert [text for _, text in levels.marks] == ["5 or less", "6", "7 or more"]
+    assert color_by("opacity", splats, every, None)[0].title == "opacity"
     splats.opacity[0] = 50
-    coloring, _ = color_by("opacity", splats, np.arange(1000), None)
-    assert coloring.title == "opacity (D)"
-    assert coloring.marks[-1] == (1.0, "1 or more")
+    opacities = color_by("opacity", splats, every, None)[0]
+    assert (opacities.title, opacities.marks[-1]) == ("opacity (D)", (1.0, "1 or more"))
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    splats = random_splats(3000)
-    return Scene(*quick.build(splats))
+    return Scene(*quick.build(random_splats(3000)))
 
 
 def plot(scene: Scene, *, size: tuple[int, int] = (320, 200), **options: object) -> DescribedPicture:
@@ -450,6 +438,8 @@ def test_the_description_counts_what_is_drawn(scene: Scene) -> None:
     assert f"Depth 3 of {depth.max()}: {nodes} node" in picture.description
     assert (f"grey: {leaves} leaves" in picture.description) == (leaves > 0)
     assert "boxes: the 1 of 1 chunks of 65,536 nodes" in picture.description
+    assert "blue: on the walls, the grid of voxels of" in picture.description
+    assert "blue: the 1 voxel of" in plot(scene, depth=0).description
 
 
 @needs_pyvista
@@ -477,19 +467,6 @@ def test_many_splats_are_points_and_more_are_a_sample(scene: Scene, monkeypatch:
 
 
 @needs_pyvista
-def test_huge_splats_are_drawn_as_points() -> None:
-    splats = random_splats(3000)
-    picture = plot(Scene(dataclasses.replace(splats, scale=np.full_like(splats.scale, 1e5))))
-    assert "points" in picture.description
-
-
-@needs_pyvista
-def test_few_voxels_are_outlined_and_many_are_a_grid(scene: Scene) -> None:
-    assert "blue: the 1 voxel of" in plot(scene, depth=0).description
-    assert "blue: on the walls, the grid of voxels of" in plot(scene).description
-
-
-@needs_pyvista
 def test_values_out_of_range_do_not_spoil_the_figure() -> None:
     good = random_splats(2000)
     alone = drawn(plot(Scene(good)))
@@ -501,13 +478,9 @@ def test_values_out_of_range_do_not_spoil_the_figure() -> None:
     picture = plot(Scene(bad))
     assert picture.description.startswith("1,995 splats")
     assert abs(drawn(picture).mean() - alone.mean()) < 0.5 * alone.mean()
-
-
-@needs_pyvista
-def test_a_small_scene_far_from_the_origin_is_drawn() -> None:
-    splats = random_splats(20)
-    center, scale = np.full_like(splats.center, 1e7), splats.scale * np.float32(1e-9)
-    assert plot(Scene(dataclasses.replace(splats, center=center, scale=scale))).png
+    assert "points" in plot(Scene(dataclasses.replace(good, scale=np.full_like(scale, 1e5)))).description
+    far = dataclasses.replace(good, center=np.full_like(center, 1e7), scale=good.scale * np.float32(1e-9))
+    assert plot(Scene(far)).png
 
 
 @needs_pyvista

@@ -136,15 +136,6 @@ def test_a_gain_shows_differences_and_cuts_few(size: float) -> None:
     assert pixels.gain_for([pixels.apart(a, a)]) == 1
 
 
-@pytest.mark.parametrize("gain", [0.5, 1.0, 20.0])
-def test_the_bar_of_a_difference_has_its_ends(gain: float) -> None:
-    bar = pixels.difference_bar(gain)
-    assert [place for place, _ in bar.marks] == [0, 0.5, 1]
-    assert float(bar.marks[-1][1].removesuffix(" or more")) == pytest.approx(1 / gain)
-    assert bar.ramp[0].tolist() == [0, 0, 0]
-    assert bar.ramp[-1].tolist() == [255, 255, 255]
-
-
 def pictures(count: int, width: int, height: int, channels: int = 3) -> list[np.ndarray]:
     rng = np.random.default_rng(count)
     return [rng.integers(0, 256, (height, width, channels)).astype(np.uint8) for _ in range(count)]
@@ -162,13 +153,6 @@ def test_cells_are_the_pictures(count: int, size: tuple[int, int]) -> None:
         assert np.array_equal(whole[y : y + height, x : x + width], picture)
     columns, rows = grid(count, size)
     assert (columns - 1) * rows < count <= columns * rows or columns * (rows - 1) < count <= columns * rows
-
-
-def test_pictures_are_laid_out_for_a_screen() -> None:
-    assert grid(4, (1280, 720)) == (2, 2)
-    assert grid(9, (1280, 720)) == (3, 3)
-    assert grid(2, (720, 1280)) == (2, 1)
-    assert grid(1, (5, 5)) == (1, 1)
 
 
 def test_one_picture_with_alpha_gives_the_sheet_alpha() -> None:
@@ -246,26 +230,10 @@ def same(count: int) -> list[np.ndarray]:
 
 
 @pytest.mark.slow
-def test_an_animated_webp_keeps_alpha() -> None:
-    made = frames(channels=4)
-    for frame in made:
-        frame[:10, :, 3] = np.linspace(0, 128, 33)
-    with Image.open(io.BytesIO(animated(made, "webp", 10.0))) as picture:
-        assert picture.convert("RGBA").getpixel((0, 5))[3] <= 4
-        assert picture.convert("RGBA").getpixel((5, 15))[3] == 255
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("fps", [7.0, 12.0, 24.0, 30.0])
 @pytest.mark.parametrize("made", [frames(), frames()[:1], moving(30, 3), same(5), [*same(3), *frames(64, 48)]])
 def test_a_gif_has_all_of_the_time(made: list[np.ndarray], fps: float) -> None:
     assert sum(durations(animated(made, "gif", fps))) == pytest.approx(1000 / fps * len(made), abs=5)
-
-
-@pytest.mark.slow
-def test_a_webp_that_stands_still_has_its_time() -> None:
-    made = [*same(30), *moving(4, 3)[3:]]
-    assert sum(durations(animated(made, "webp", 10.0))) == 100 * len(made)
 
 
 @pytest.mark.slow

@@ -127,14 +127,6 @@ def test_clipping_is_that_of_the_reference() -> None:
     assert_agrees(dataclasses.replace(shown(400, scale=0.05), center=center), CAMERAS["front"])
 
 
-@needs_opengl
-@pytest.mark.parametrize("size", [(1, 1), (17, 300), (300, 17)])
-@pytest.mark.parametrize("precision", osmesa.PRECISIONS)
-def test_pictures_of_any_size_are_those_of_the_reference(size: tuple[int, int], precision: str) -> None:
-    image = assert_agrees(SPLATS["large"], camera((0, 0, 3), size=size), LOOK, HALF, precision=precision)
-    assert image.shape == (size[1], size[0], 4)
-
-
 def orange(center: tuple[float, float, float] = (0, 0, 0), d: float = 0.5) -> ShadedSplats:
     return one(center, 0.1, d, (1, 0.5, 0.25))
 

@@ -241,9 +241,3 @@ def test_gradients_of_spherical_harmonics_are_differences_of_the_twin_s_colours(
     expected = ((after - before) * by_rgb).sum(axis=1)
     found = (by_color * steps["rgb"]).sum(axis=1) + (by_coefficient * steps["sh"]).sum(axis=(1, 2))
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
-
-
-def test_a_splat_at_the_camera_has_no_direction() -> None:
-    center = np.zeros((1, 3), np.float32)
-    _, by_coefficient = by_sh(center, np.zeros(3), 15, np.ones((1, 3), np.float32), np.ones((1, 3), np.float32))
-    assert not by_coefficient.any()
