@@ -1,16 +1,16 @@
 """Palettes of spherical harmonics: a few codes for the coefficients of many splats, and a label for each splat.
 
-The codes are those of a k-means clustering. Its distance is the squared error of the coefficients, which is the squared
-error of the colour over all directions, as spherical harmonics are orthonormal. With few rows to a code, the error
-depends more on where k-means starts than on its passes, which take their time to find the nearest code of each row. So:
+Codes are found by k-means clustering of the coefficients. Its distance is their squared error, which is the squared
+error of the colour over all directions, since spherical harmonics are orthonormal. With few rows to a code, the error
+depends more on the start of k-means than on its passes, most of whose time finds the nearest code of each row. So:
 
 1. Equal rows become one row with their weight.
-2. Bisection: the cell of rows whose halves have the least error in proportion to its own is halved, until there are as
-   many cells as codes; that is, always the cell that gains most. A cell is cut across its direction of largest spread.
-3. Passes of k-means that look for the code of a row among the neighbours of the code that it has.
+2. Bisection: cells of rows are halved, always those whose error shrinks most, until there are as many cells as codes. A
+   cell is cut across its direction of largest spread.
+3. Passes of k-means search the code of a row among the neighbours of its present code.
 
 There are no random numbers, and no sum depends on the number of threads: the same rows always give the same palette.
-docs/decisions/09-palettes-and-sog.md has what it was measured against.
+docs/decisions/09-palettes-and-sog.md has measurements.
 """
 
 from __future__ import annotations
@@ -24,24 +24,22 @@ from ..model.splats import FloatArray, Splats
 from ..system.progress import Progress, silent
 from ..system.threads import blocks_of, on_threads
 
-#: Passes of k-means. Measured: more gain less than 0.5 % of the error.
-PASSES = 6
+#: Passes of k-means, and those before which the neighbours of all codes are found anew. Measured: more passes gain less
+#: than 0.5 % of the error.
+PASSES, FRESH = 6, (0, 3)
 
-#: The passes, from 0, before which the neighbours of all codes are found anew.
-FRESH = (0, 3)
-
-#: Neighbours of a code among which the codes of its rows are looked for, a multiple of `sh_clustering.LANES`; and the
-#: groups of `sh_clustering.GROUP` codes that are searched for them. Measured.
+#: Neighbours of a code that are tried for its rows, a multiple of `sh_clustering.LANES`; and groups of
+#: `sh_clustering.GROUP` codes that are searched for these neighbours. Measured.
 NEIGHBOURS, SEARCH = 48, 16
 
-#: Cells are halved together whose gain is at least this share of the largest. Measured: 0.8 takes three times as many
+#: Least gain of cells that are halved together, as a share of the largest gain. Measured: 0.8 takes three times as many
 #: rounds for less than 1.5 % of the error.
 TOGETHER = 0.5
 
-#: Least weight of a row, as a share of the mean: rows without weight get codes, too. Chosen.
+#: Least weight of a row, as a share of the mean: rows without weight also get codes. Chosen.
 WEIGHT_FLOOR = 1e-6
 
-#: Power of the seen area in `visible_weight`. Measured: 1 is better in far views, 0.5 in near ones.
+#: Power of the visible area in `visible_weight`. Measured: 1 is better in far views, 0.5 in near ones.
 AREA_POWER = 0.75
 
 Indices = NDArray[np.uint32]
@@ -51,24 +49,20 @@ Offsets = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class ShPalette:
-    """Palette of spherical harmonics: (C, K, 3) coefficients as in `Splats.sh`, and (N,) the code of each row.
-
-    Each code is that of some row.
-    """
+    """Palette of spherical harmonics: (C, K, 3) coefficients as in `Splats.sh`, all in use, and (N,) codes of rows."""
 
     codes: FloatArray
     labels: Indices
 
     def expand(self) -> FloatArray:
-        """Return (N, K, 3) float32, the code of each row."""
+        """Return the (N, K, 3) float32 coefficients of all rows."""
         return self.codes[self.labels]
 
 
 def visible_weight(splats: Splats) -> Weights:
-    """Return (N,) how much an error in the SH of a splat is seen: (opacity * area) ** AREA_POWER.
+    """Return the (N,) visibility of errors in the SH of splats: (opacity * area of the two longest axes) ** AREA_POWER.
 
-    The area is that of its two longest axes. Splats of any size are seen at some distance; the power below 1 leaves the
-    small ones, which are seen near by, their part.
+    The power below 1 leaves weight to small splats, which are seen from near by.
     """
     axes = np.sort(splats.scale.astype(np.float64), axis=1)
     weight: Weights = (splats.opacity * axes[:, 1] * axes[:, 2]) ** AREA_POWER
@@ -78,18 +72,17 @@ def visible_weight(splats: Splats) -> Weights:
 def cluster(
     sh: FloatArray, codes: int, *, weight: ArrayLike | None = None, threads: int | None = 1, progress: Progress = silent
 ) -> ShPalette:
-    """Find a palette for the coefficients of splats.
+    """Find a palette for the coefficients of splats, the same for any number of threads.
 
-    The result is the same for any number of threads. If there are at most `codes` different rows, the palette holds
-    just these, exactly. The code of a row is the nearest one or, of rows between many codes, nearly: their squared
-    error is about 1 % larger in all than with the nearest.
+    If at most `codes` rows differ, the palette holds just these, exactly. Otherwise rows get nearly the nearest codes:
+    their total squared error is about 1 % larger than with the nearest.
 
     Args:
         sh: (N, K, 3) finite float32 coefficients, K at least 1.
-        codes: the most codes, 1 to `options.MAX_SH_CODES`.
-        weight: (N,) how much the squared error of each row counts, finite and at least 0; None for 1 each.
-        threads: to work on; None for all processors.
-        progress: called with the number of cells, and then the passes of k-means.
+        codes: largest number of codes, 1 to `formats.MAX_SH_CODES`.
+        weight: (N,) weights of the squared errors of rows, finite and at least 0; None for equal weights.
+        threads: number of threads; None for all processors.
+        progress: receives the number of cells, and then the passes of k-means.
 
     Raises:
         ValueError: a coefficient is not finite.
@@ -110,7 +103,7 @@ def cluster(
 
 
 def _weights(weight: ArrayLike | None, count: int) -> Weights:
-    """Return the weights of rows, positive, 1 in the mean."""
+    """Return positive weights of rows with a mean of 1."""
     if weight is None:
         return np.ones(count)
     relative = np.asarray(weight, np.float64)
@@ -123,7 +116,7 @@ def _weights(weight: ArrayLike | None, count: int) -> Weights:
 
 
 def _distinct(rows: FloatArray) -> tuple[Indices, Indices]:
-    """Return the first of each set of equal rows, ascending, and for each row its place among these."""
+    """Return the first row of each set of equal rows, ascending, and the place of each row among these."""
     from .kernels.sh_clustering import hash_rows
 
     key = np.empty(len(rows), np.uint64)
@@ -143,7 +136,7 @@ def _distinct(rows: FloatArray) -> tuple[Indices, Indices]:
 
 
 class _Clustering:
-    """Clustering of the (M,) `first` of (N, D) float32 rows, with a weight for each of them."""
+    """Clustering of (M,) rows, `first`, of (N, D) float32 rows, by their weights."""
 
     def __init__(self, rows: FloatArray, first: Indices, weight: Weights, progress: Progress) -> None:
         self._rows = rows
@@ -153,7 +146,7 @@ class _Clustering:
         self._progress = progress
 
     def run(self, codes: int) -> tuple[FloatArray, Indices]:
-        """Return (C, D) codes, and the (M,) labels of the rows."""
+        """Return (C, D) codes, and (M,) labels of the rows."""
         from .kernels.sh_clustering import average_cells, choose_codes
 
         members, begin = self._bisect(codes)
@@ -165,7 +158,7 @@ class _Clustering:
             if number in FRESH:
                 near, distance = _neighbours(table)
             else:
-                distance = np.zeros_like(distance)  # codes have moved: nothing is known
+                distance = np.zeros_like(distance)  # unknown, since codes have moved
             choose_codes(len(table), self._rows, members, begin, table, near, distance, labels, errors)
             if number < PASSES - 1:
                 members, begin = self._cells(labels, len(table))
@@ -179,11 +172,10 @@ class _Clustering:
         return table[used], compact.astype(np.uint32)
 
     def _bisect(self, codes: int) -> tuple[Indices, Offsets]:
-        """Divide the rows into cells: `codes` of them, or fewer if rows are too near each other.
+        """Divide the rows into `codes` cells, or fewer if rows are too near each other.
 
-        Every new cell is halved at once, which shows by how much the error shrinks if both halves replace it; then the
-        cells with the largest gain are replaced by their halves. Returns (M,) rows, cell after cell, neighbours near
-        each other, and (C + 1,) where each cell begins.
+        Every new cell is halved at once to know the gain of replacing it by its halves; then the cells with the largest
+        gain are replaced. Returns (M,) rows, cell after cell, and the (C + 1,) begins of cells.
         """
         from .kernels.sh_clustering import halve_cells
 
@@ -211,13 +203,13 @@ class _Clustering:
         return members, np.append(np.sort(begin), len(members))
 
     def _cells(self, labels: NDArray[np.int32], codes: int) -> tuple[Indices, Offsets]:
-        """Return the rows of each code, ascending, code after code, and where those of each begin."""
+        """Return the rows of each code, ascending, code after code, and the begins of these cells."""
         of_first = labels[self._first].astype(np.uint16)  # which numpy sorts by radix
         begin = np.concatenate([[0], np.cumsum(np.bincount(of_first, minlength=codes))])
         return self._first[np.argsort(of_first, kind="stable")], begin
 
     def _refill(self, empty: NDArray[np.intp], labels: NDArray[np.int32], errors: FloatArray) -> None:
-        """Give codes that have no rows those with the largest error, one each."""
+        """Give codes without rows the rows with the largest errors, one each."""
         cost = self._weight[self._first] * errors[self._first]
         worst = np.argsort(-cost, kind="stable")[: len(empty)]
         worst = worst[cost[worst] > 0]
@@ -240,28 +232,28 @@ def _neighbours(table: FloatArray) -> tuple[NDArray[np.int32], FloatArray]:
     return near, distance
 
 
-#: Codes of a group, and the groups that are searched for a row. Measured: the squared error of all rows is 1 to 2 %
-#: larger than with the nearest code of 16,384, and up to 9 % with 45,000 that nothing but equality told apart.
-GROUP, SEARCH = 256, 16
+#: Codes of a group in `labels_of`, and groups that are searched for a row. Measured: the squared error of all rows is 1
+#: to 2 % larger than with the nearest code of 16,384, and up to 9 % with 45,000 codes that merely differ.
+GROUP, SEARCHED = 256, 16
 
 
 def labels_of(sh: FloatArray, codes: FloatArray) -> NDArray[np.uint32]:
-    """Return (N,) uint32 codes of rows that the palette was not made of: the nearest of all or, of few rows, nearly.
+    """Return (N,) uint32 codes of other rows: the nearest code or, for few rows, nearly.
 
-    The nearest code is looked for in the groups of codes whose means are nearest to the row.
+    The search is limited to the groups of codes whose means are nearest to the row.
 
     Args:
         sh: (N, K, 3) finite float32 coefficients.
-        codes: (C, K, 3) those of a palette, C at least 1.
+        codes: (C, K, 3) coefficients of a palette, C at least 1.
     """
     table = codes.reshape(len(codes), -1).astype(np.float64)
     groups = _groups(table, np.arange(len(table)))
     means = np.stack([table[group].mean(axis=0) for group in groups])
     half, half_of_means = (np.einsum("ij,ij->i", each, each) / 2 for each in (table, means))
-    search = min(SEARCH, len(groups))
+    search = min(SEARCHED, len(groups))
     labels = np.empty(len(sh), np.uint32)
     for part in blocks_of(len(sh)):
-        # Of |row - code|^2 / 2, |row|^2 / 2 is left out: it is the same for all codes.
+        # |row - code|^2 / 2 without |row|^2 / 2, which is the same for all codes.
         rows = sh[part].reshape(part.stop - part.start, -1).astype(np.float64)
         near = np.argpartition(half_of_means - rows @ means.T, search - 1, axis=1)[:, :search].ravel()
         by_group = np.argsort(near, kind="stable")
@@ -279,7 +271,7 @@ def labels_of(sh: FloatArray, codes: FloatArray) -> NDArray[np.uint32]:
 
 
 def _groups(table: NDArray[np.float64], codes: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Group codes, of (C, D) all, by at most `GROUP` near each other: halves along the most varied coefficient."""
+    """Divide codes of a (C, D) table into groups of at most `GROUP`, by halving along the most varied coefficient."""
     if len(codes) <= GROUP:
         return [codes]
     rows = table[codes]

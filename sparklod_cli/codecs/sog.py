@@ -49,37 +49,14 @@ from .sog_images import (
     read_header,
 )
 
-# Files of a scene: meta.json and images, in a zip or a folder. Sizes are checked before decoding.
-
-#: Sides of images are multiples of this, as PlayCanvas makes them.
-STEP = 4
-
-
-def size_for(count: int) -> tuple[int, int]:
-    """Return width and height of the image for a number of splats: about a square."""
-    width = STEP * math.ceil(math.sqrt(count) / STEP)
-    return width, STEP * math.ceil(count / width / STEP)
-
-
-def image_of(texels: Texels, width: int, height: int) -> Texels:
-    """Arrange (N, C) texels row by row as (height, width, C), with zeros behind them."""
-    image = np.zeros((height * width, texels.shape[1]), np.uint8)
-    image[: len(texels)] = texels
-    return image.reshape(height, width, -1)
-
-
-#: Largest meta.json, bytes; codebooks take 15,000.
+#: Largest meta.json in bytes; codebooks take 15,000.
 MAX_META = 1 << 22
 
-#: Permissions of the members of a zip that is written, and the system that has them, 3 for Unix.
-MODE, UNIX = 0o100644 << 16, 3
-
-#: Texels that an image may have: a multiple of the splats, and some more, since writers make images square or round
+#: Allowed number of texels of an image, as a multiple of the splats and a constant: writers make images square or round
 #: sides up to powers of two.
 SPARE_FACTOR, SPARE_TEXELS = 4, 1 << 16
 
-
-#: Largest magnitude of a number in meta.json, so that float32 holds what is computed from it.
+#: Largest magnitude of a number in meta.json, so that float32 holds the values computed from it.
 LARGEST = 1e38
 
 
@@ -92,19 +69,19 @@ def parse_meta(data: bytes) -> Json:
 
 
 def has(meta: Json, key: str) -> bool:
-    """Return True if a meta.json has a key with a value that is not null, false, "" or empty, as viewers test it."""
+    """Return whether a meta.json has a key whose value is not null, false, "" or empty, as viewers test it."""
     value = meta.value.get(key)
     return bool(value) or type(value) is int
 
 
 def image_names(meta: Json) -> list[str]:
-    """Return the images of a scene that a meta.json names, texture by texture."""
+    """Return the names of the images of a scene, texture by texture."""
     images = {texture: len(files) for texture, files in SOG_IMAGES.items() if texture != "shN" or has(meta, "shN")}
     return [meta.text(texture, "files", index) for texture, count in images.items() for index in range(count)]
 
 
 def companion_names(data: bytes) -> list[str]:
-    """Return all files that a meta.json names, images or not; none if it cannot be parsed."""
+    """Return all files that a meta.json names, images or not; an empty list if it is invalid."""
     try:
         root = parse_meta(data).value
     except FormatError:
@@ -114,11 +91,11 @@ def companion_names(data: bytes) -> list[str]:
 
 
 class SogFiles:
-    """Files of a SOG scene.
+    """Files of a SOG scene, in a zip or a folder.
 
     Attributes:
-        meta: its meta.json.
-        size: bytes of all its files, which bound the sizes that images may announce.
+        meta: parsed meta.json.
+        size: size of all files in bytes, which limits the sizes that images may announce.
     """
 
     def __init__(self, file: BinaryIO, open_companion: OpenCompanion | None) -> None:
@@ -130,22 +107,24 @@ class SogFiles:
             raise NotSplatsError(f"a zip archive with {self._archive.first}, not a SOG")
         self._companion = open_companion
         self.meta = parse_meta((self._archive.open(META) if self._archive else file).read(MAX_META + 1))
-        self._sizes = {} if self._archive else {name: self._companion_size(name) for name in image_names(self.meta)}
+        self._sizes = dict[str, int]()
+        for name in [] if self._archive else image_names(self.meta):
+            with self._file(name) as image:
+                self._sizes[name] = image.seek(0, io.SEEK_END)
         self.size += sum(self._sizes.values())
 
-    def _open_companion(self, name: str) -> BinaryIO:
+    def _file(self, name: str, *, whole: bool = True) -> contextlib.AbstractContextManager[IO[bytes]]:
+        """Open an image; `whole` is that of `ZipFolder.opened`."""
+        if self._archive is not None:
+            return self._archive.opened(name, whole=whole)
         if self._companion is None:
             raise FormatError(f"{META} names {quoted_value(name)}, but other files cannot be opened here")
         return self._companion(name)
 
-    def _companion_size(self, name: str) -> int:
-        with self._open_companion(name) as file:
-            return size_of(file)
-
     @contextlib.contextmanager
     def _opened(self, name: str, most: int) -> Iterator[tuple[WebPHeader, IO[bytes]]]:
-        """Open an image that may have at most `most` texels, and read its header."""
-        with self._archive.opened(name) if self._archive else self._open_companion(name) as file:
+        """Open an image of at most `most` texels, and read its header."""
+        with self._file(name) as file:
             header = read_header(file.read, name)
             if header.width * header.height > most:
                 raise FormatError(f"{quoted_value(name)} has {header.width} x {header.height} texels, far too many")
@@ -153,7 +132,7 @@ class SogFiles:
             yield header, file
 
     def sides(self, texture: str, index: int, most: int) -> tuple[int, int]:
-        """Return the width and height in the header of an image; `FormatError` if it has more than `most` texels."""
+        """Read the width and height of an image; `FormatError` if it has more than `most` texels."""
         with self._opened(self.meta.text(texture, "files", index), most) as (header, _):
             return header.width, header.height
 
@@ -167,30 +146,30 @@ class SogFiles:
             return pixels_of(header, file.read, name)[:count]
 
     def lossy(self) -> list[str]:
-        """Return the names of the images that are compressed with losses."""
+        """Return the names of the images with lossy compression."""
         return [name for name in image_names(self.meta) if self._is_lossy(name)]
 
     def _is_lossy(self, name: str) -> bool:
         try:
-            with self._archive.opened(name, whole=False) if self._archive else self._open_companion(name) as file:
+            with self._file(name, whole=False) as file:
                 return read_header(file.read, name).lossy
         except FormatError:  # which reading the splats reports
             return False
 
     def bytes_of(self, texture: str, index: int) -> int:
-        """Return the stored size of an image."""
+        """Return the stored size of an image in bytes."""
         name = self.meta.text(texture, "files", index)
         return self._archive.bytes_of(name) if self._archive else self._sizes[name]
 
 
 def zipped(files: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
-    """Return the bytes of a zip, piece by piece: the same for the same files, as its members have no dates."""
-    # A buffer that is emptied member by member could not be sought, and sizes would follow the members' contents.
+    """Encode a zip piece by piece: the same bytes for the same files, since its members have no dates."""
+    # The buffer is not emptied: a zip that cannot seek has sizes after the members' contents.
     buffer, done = io.BytesIO(), 0
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, content in files:
             member = zipfile.ZipInfo(name)  # of 1980, the earliest date
-            member.create_system, member.external_attr = UNIX, MODE
+            member.create_system, member.external_attr = 3, 0o100644 << 16  # Unix, and permissions there
             archive.writestr(member, content)
             yield buffer.getvalue()[done:]
             done = buffer.tell()
@@ -199,7 +178,7 @@ def zipped(files: Iterable[tuple[str, bytes]]) -> Iterator[bytes]:
 
 # Reading.
 
-#: Most splats: a WebP image has at most this many texels.
+#: Most splats, the texels of the largest WebP image.
 MAX_SPLATS = 1 << 28
 
 #: Shifts of the channels in a pixel.
@@ -207,7 +186,7 @@ RED_GREEN_BLUE, ALPHA = np.array([16, 8, 0], np.uint32), np.array([24], np.uint3
 
 
 class Step(NamedTuple):
-    """Decoding of an image, by its texture and number: `fill` fills rows by their pixels, and may return a problem."""
+    """Decoding of an image of a texture: `fill` fills rows from their pixels, and may return a problem."""
 
     texture: str
     number: int
@@ -215,7 +194,7 @@ class Step(NamedTuple):
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open a .sog archive, or the meta.json of an unpacked one. With `scratch`, the images are unpacked to that.
+    """Open a .sog archive, or the meta.json of an unpacked one; reading blocks unpacks images to `scratch`.
 
     Raises:
         FormatError: the file is not SOG, not of version 1 or 2, corrupt, or lacks an image.
@@ -240,7 +219,7 @@ def open_content(source: OpenFile) -> Reader:
     center_tables = codings.center_table(*_ends(meta, "means", 3))
 
     def in_order() -> list[Step]:
-        """Sort the steps, the largest first, so that no thread is left alone with it; SH labels need the palette."""
+        """Sort the steps by size, so that no thread ends with the largest; SH labels, which need the palette, last."""
         return sorted(steps, key=lambda step: (step.texture == "shN", -files.bytes_of(step.texture, step.number)))
 
     def unpacked() -> Iterator[bytes]:
@@ -286,7 +265,7 @@ def _steps(meta: Json, version: int, palette: SogPalette | None) -> list[Step]:
     opacity = quantize.decode_logit(colors[3]) if version == 1 else quantize.decode_unorm8(byte)
 
     def words(place: int, splats: Splats, pixels: Pixels) -> None:
-        """Put a byte of the codes of coordinates in the place of the coordinates; two threads do so at a time."""
+        """Store a byte of the codes of coordinates in the memory of the coordinates, where `finish` decodes them."""
         texels.place_bytes(pixels, splats.center.view(np.uint8), place)
 
     def color(splats: Splats, pixels: Pixels) -> None:
@@ -311,7 +290,7 @@ def _fill_sh(palette: SogPalette, splats: Splats, pixels: Pixels) -> str | None:
 
 
 def _tables(meta: Json, name: str, version: int, channels: int) -> FloatArray:
-    """Return (channels, 256) float32 values of bytes: of a codebook in version 2, of ranges in version 1."""
+    """Return the (channels, 256) float32 values of bytes, by a codebook in version 2, by ranges in version 1."""
     if version == 2:
         return np.tile(_codebook(meta, name), (channels, 1))
     return quantize.range_table(*_ends(meta, name, channels), 256).astype(np.float32)
@@ -323,7 +302,7 @@ def _ends(meta: Json, name: str, channels: int) -> tuple[NDArray[np.float64], ND
 
 
 def _codebook(meta: Json, name: str) -> FloatArray:
-    """Return (256,) values. An old writer left null for the first one, which the mean step extrapolates."""
+    """Return (256,) values; a first value of null, of an old writer, is extrapolated by the mean step."""
     book = meta.get(name, "codebook")
     if isinstance(book.value, list) and len(book.value) == 256 and book.value[0] is None:
         rest = [each.number(most=LARGEST) for each in list(book.items())[1:]]
@@ -332,7 +311,7 @@ def _codebook(meta: Json, name: str) -> FloatArray:
 
 
 class SogPalette:
-    """Palette of SH, decoded when it is needed: K coefficients of each entry, and the number of entries."""
+    """Palette of SH, decoded on demand: number of coefficients of an entry, and number of entries."""
 
     def __init__(self, files: SogFiles, version: int) -> None:
         width, height = files.sides("shN", 0, MAX_SH_CODES * COEFFICIENTS[3])
@@ -348,16 +327,15 @@ class SogPalette:
             return
         bands, count = files.meta.whole("shN", "bands"), files.meta.whole("shN", "count")
         if bands not in (1, 2, 3) or COEFFICIENTS[bands] != self.coefficients:
-            raise FormatError(
-                f"its image of SH centroids has {self.coefficients} coefficients, not those of {bands} bands"
-            )
+            text = f"its image of SH centroids has {self.coefficients} coefficients"
+            raise FormatError(f"{text}, not those of {bands} bands")
         if not 0 < count <= self.entries:
             raise FormatError(f"its image of SH centroids has {self.entries:,} entries, not {count:,}")
         self.entries = count
         self._book = _codebook(files.meta, "shN")
 
     def values(self) -> FloatArray:
-        """Return (entries, K, 3) SH coefficients, on any thread."""
+        """Return (entries, K, 3) SH coefficients; several threads may call this."""
         with self._lock:
             if self._values is None:
                 values = np.empty((self._texels, 3), np.float32)
@@ -369,19 +347,22 @@ class SogPalette:
 
 # Writing.
 
+#: Sides of images are multiples of this, as in PlayCanvas's files.
+STEP = 4
+
 #: Power of the weights of splats in the palette of SH. With 1, pictures are better still, but the error of coefficients
 #: is larger than that of splat-transform's; benchmarks/notes/file-sizes.md has the measurements.
 SEEN = 0.5
 
-#: The tilt of the book of scales: large splats, which are few, make most of a picture. Measured: 34,902 merged splats
-#: come 6.6 dB closer to their source with 1 than with 0, and scales are off by 1.6 % instead of 1.0 %.
+#: Tilt of the book of scales: large splats, which are few, make most of a picture. Measured: 34,902 merged splats come
+#: 6.6 dB closer to their source with 1 than with 0, and scales are off by 1.6 % instead of 1.0 %.
 LARGE = 1.0
 
-#: By how much codes may make a scale larger: a factor, a share of the splat's largest scale, and a length in world
-#: units. The bounds of Streamed SOG's regions leave room for it. Scenes whose scales differ by 1e30 exceed it.
+#: Largest growth of a scale by its code: a factor, a share of the splat's largest scale, and a length in world units,
+#: for which the bounds of Streamed SOG's regions leave room. Scenes whose scales differ by 1e30 exceed it.
 GROWTH, GROWTH_OF_LARGEST, GROWTH_OF_ALL = 4 / 3, 0.01, 1e-4
 
-#: Default number of codes of the smallest palette, and of the steps in which it grows, as in PlayCanvas's writer.
+#: Default number of codes of the smallest palette, and unit of larger ones, as in PlayCanvas's writer.
 LEAST_CODES = 1024
 
 #: Largest colour and SH coefficient: float32 holds the squares of their differences. Chosen.
@@ -389,16 +370,25 @@ LARGEST_COLOR = 1e15
 
 Order = NDArray[np.intp]
 
+#: Facts of a texture for meta.json, without the names of its files, and its images.
+Texture = tuple[Mapping[str, Any], Sequence[Texels]]
 
-class Texture(NamedTuple):
-    """Texture: its facts for meta.json, without the names of its files, and the image of each of these."""
 
-    facts: Mapping[str, Any]
-    images: Sequence[Texels]
+def size_for(count: int) -> tuple[int, int]:
+    """Return width and height of the image for a number of splats: about a square."""
+    width = STEP * math.ceil(math.sqrt(count) / STEP)
+    return width, STEP * math.ceil(count / width / STEP)
+
+
+def _image_of(texels: Texels, width: int, height: int) -> Texels:
+    """Arrange (N, C) texels row by row as (height, width, C), with zeros behind them."""
+    image = np.zeros((height * width, texels.shape[1]), np.uint8)
+    image[: len(texels)] = texels
+    return image.reshape(height, width, -1)
 
 
 def codes_for(count: int) -> int:
-    """Return the default number of SH codes: one for one to two splats, from 1,024 to 65,536."""
+    """Return the default number of SH codes, one for one to two splats, from 1,024 to 65,536."""
     steps = 2 ** math.floor(math.log2(count / LEAST_CODES)) if count > LEAST_CODES else 1
     return min(LEAST_CODES * steps, MAX_SH_CODES)
 
@@ -407,10 +397,9 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     """Return the options with nothing left open.
 
     Raises:
-        FormatError: the scene has a tree or no splats, or values that SOG cannot hold: opacities above 1, more splats
-            than an image has texels.
+        FormatError: the scene has a tree or no splats, or SOG cannot hold its values or number of splats.
     """
-    codes = options.sog.sh_codes
+    codes, splats = options.sog.sh_codes, scene.splats
     if scene.tree is not None:
         raise FormatError("SOG holds no Level-of-Detail tree")
     count = len(scene)
@@ -419,26 +408,21 @@ def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
     if max(size_for(count)) > MAX_SIDE:
         most = MAX_SIDE // 4 * 4
         raise FormatError(f"{count_of(count, 'splat')}; a SOG holds at most {most * most:,}")
-    _check(scene.splats)
-    sog = dataclasses.replace(options.sog, sh_codes=codes_for(count) if codes is None else codes)
-    return dataclasses.replace(options, sog=sog)
-
-
-def _check(splats: Splats) -> None:
-    """Raise a `FormatError` where splats have values that SOG cannot hold."""
-    most = float(splats.opacity.max())
-    if most > 1:
-        raise FormatError(f"opacities reach {most:.6g}, and SOG holds 0 to 1; clip them first")
+    opacity = float(splats.opacity.max())
+    if opacity > 1:
+        raise FormatError(f"opacities reach {opacity:.6g}, and SOG holds 0 to 1; clip them first")
     for name, column in (("colours", splats.rgb), ("spherical harmonics", splats.sh)):
         largest = float(max(column.max(initial=0), -column.min(initial=np.float32(0))))
         if largest > LARGEST_COLOR:
             raise FormatError(f"{name} reach {largest:.3g}, and SOG is written with at most {LARGEST_COLOR:g}")
+    sog = dataclasses.replace(options.sog, sh_codes=codes_for(count) if codes is None else codes)
+    return dataclasses.replace(options, sog=sog)
 
 
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """Return the bytes of a bundled SOG, piece by piece: the same for any number of threads, in Morton order."""
+    """Encode a bundled SOG in Morton order, piece by piece; the bytes are the same for any number of threads."""
     yield from zipped(encode_files(scene, options, threads=threads, progress=progress))
 
 
@@ -450,21 +434,21 @@ def encode_files(
     progress: Progress = silent,
     in_order: bool = False,
 ) -> Iterator[tuple[str, bytes]]:
-    """Return the files of an unbundled SOG: the name of each, and its bytes; meta.json is last.
+    """Yield the name and bytes of each file of an unpacked SOG, meta.json last.
 
-    Splats are in Morton order, or `in_order` in their own.
+    Args:
+        in_order: keep the order of splats; otherwise they are in Morton order.
     """
     options = settled(scene, options)
     splats = scene.splats
     low, high = (codings.sign_log(end) for end in (splats.center.min(axis=0), splats.center.max(axis=0)))
     words = codings.encode_center(splats.center, low, high)
-    # The order of the codes: images get smaller than in the order of the centres, and a scene that was read from them
-    # is written in the same order again.
+    # By the order of codes, images are smaller than by that of centres, and a scene that was read from them keeps it.
     order = np.arange(len(splats)) if in_order else morton.order_of_cells(words)
     makers: dict[str, Callable[[], Texture]] = {
         "means": functools.partial(_means, words, low, high, order),
         "scales": functools.partial(_scales, splats.scale, order),
-        "quats": lambda: Texture({}, [_per_splat(codings.encode_quat(splats.quat_xyzw[order]))]),
+        "quats": lambda: ({}, [_per_splat(codings.encode_quat(splats.quat_xyzw[order]))]),
         "sh0": functools.partial(_sh0, splats, order),
     }
     if splats.sh_degree:
@@ -478,25 +462,25 @@ def encode_files(
     if scene.antialiased:
         meta["model"] = "antialiased"  # as PlayCanvas's tools have called it since 2026
 
-    def work(name: str) -> tuple[str, Texture, list[bytes]]:
-        texture = makers[name]()
-        return name, texture, [encode_webp(image) for image in texture.images]
+    def work(name: str) -> tuple[str, Mapping[str, Any], list[bytes]]:
+        facts, images = makers[name]()
+        return name, facts, [encode_webp(image) for image in images]
 
-    for number, (name, texture, contents) in enumerate(ordered_map(work, makers, threads)):
-        meta[name] = {**texture.facts, "files": list(SOG_IMAGES[name])}
+    for number, (name, facts, contents) in enumerate(ordered_map(work, makers, threads)):
+        meta[name] = {**facts, "files": list(SOG_IMAGES[name])}
         yield from zip(SOG_IMAGES[name], contents, strict=True)
         progress("encoding", number + 1, len(makers), "image")
     yield META, json.dumps(meta, separators=(",", ":")).encode()
 
 
 def _per_splat(texels: Texels) -> Texels:
-    return image_of(texels, *size_for(len(texels)))
+    return _image_of(texels, *size_for(len(texels)))
 
 
 def _means(words: codings.Words, low: codings.Wide, high: codings.Wide, order: Order) -> Texture:
     ordered = words[order]
     images = [_per_splat(part.astype(np.uint8)) for part in (ordered & np.uint16(255), ordered >> np.uint16(8))]
-    return Texture({"mins": low.tolist(), "maxs": high.tolist()}, images)
+    return {"mins": low.tolist(), "maxs": high.tolist()}, images
 
 
 def _scales(scale: FloatArray, order: Order) -> Texture:
@@ -506,12 +490,12 @@ def _scales(scale: FloatArray, order: Order) -> Texture:
     if _grows(scale, codes, book):
         book = even_codebook(logs)
         codes = nearest(logs, book)
-    return Texture({"codebook": _numbers(book)}, [_per_splat(codes[order])])
+    return {"codebook": _numbers(book)}, [_per_splat(codes[order])]
 
 
 @np.errstate(over="ignore")  # the largest scales have no room above them
 def _grows(scale: FloatArray, codes: NDArray[np.uint8], book: FloatArray) -> bool:
-    """Return True if codes of a book make a splat so much larger that it may leave the bound of its region."""
+    """Return whether the codes of a book make a splat grow so much that it may leave the bound of its region."""
     values = np.exp(book)
     for block in blocks_of(len(scale)):
         largest = np.max(scale[block], axis=1, keepdims=True)
@@ -525,11 +509,11 @@ def _sh0(splats: Splats, order: Order) -> Texture:
     dc = quantize.encode_dc(splats.rgb)
     book = codebook(dc)
     texels = np.column_stack([nearest(dc[order], book), quantize.encode_unorm8(splats.opacity[order])])
-    return Texture({"codebook": _numbers(book)}, [_per_splat(texels)])
+    return {"codebook": _numbers(book)}, [_per_splat(texels)]
 
 
 def _sh(palette: sh_palette.ShPalette, degree: int, order: Order) -> Texture:
-    """Return the palette, its codes in the order in which splats have them first: those of neighbours are near."""
+    """Return the palette with its codes in the order of their first splats, so that neighbours have near codes."""
     labels = palette.labels[order]
     used, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     by_first = np.argsort(first)
@@ -540,12 +524,12 @@ def _sh(palette: sh_palette.ShPalette, degree: int, order: Order) -> Texture:
     book = codebook(codes)
     count, coefficients = codes.shape[:2]
     rows = -(-count // codings.PALETTE_WIDTH)
-    centroids = image_of(nearest(codes, book).reshape(-1, 3), codings.PALETTE_WIDTH * coefficients, rows)
+    centroids = _image_of(nearest(codes, book).reshape(-1, 3), codings.PALETTE_WIDTH * coefficients, rows)
     texels = np.stack([words & np.uint16(255), words >> np.uint16(8), np.zeros_like(words)], axis=1)
     facts = {"count": count, "bands": degree, "codebook": _numbers(book)}
-    return Texture(facts, [centroids, _per_splat(texels.astype(np.uint8))])
+    return facts, [centroids, _per_splat(texels.astype(np.uint8))]
 
 
 def _numbers(book: FloatArray) -> list[float]:
-    """Return the numbers of a book with as many digits as distinguish float32."""
+    """Return the numbers of a book with the fewest digits that identify a float32."""
     return [float(str(value)) for value in book]

@@ -1,7 +1,4 @@
-"""Images of SOG: pairs of encode and decode for numbers in texels, codebooks of 256 values, and WebP files.
-
-A decode, or the table that it looks up, states its largest error.
-"""
+"""Images of SOG: codings of numbers in texels, codebooks of 256 values, and WebP files."""
 
 from __future__ import annotations
 
@@ -22,6 +19,7 @@ from . import quantize
 from .merging import PIECE
 
 Bytes = NDArray[np.uint8]
+Texels = NDArray[np.uint8]
 Words = NDArray[np.uint16]
 Wide = NDArray[np.float64]
 
@@ -34,21 +32,17 @@ LAST_WORD = 0xFFFF
 #: Alpha of a rotation's texel minus the index, in w x y z, of the largest component.
 FIRST_TAG = 252
 
-
 #: Codes of a book: a channel of a texel has 8 bits.
 CODES = 256
 
-#: Bins of the histogram that weighs the numbers. Chosen.
-BINS = 4096
+#: Bins of the histogram that weighs numbers, each with the power CROWDING of its count, so that the few numbers far
+#: from all others, such as the scales of a background, get codes, too. Chosen.
+BINS, CROWDING = 4096, 0.5
 
-#: A bin of n numbers weighs n ** CROWDING as much as a bin of one, so that the few numbers far from the others, such as
-#: the scales of a background, get codes, too. Chosen.
-CROWDING = 0.5
-
-#: Passes of k-means; from where it starts here, more change nothing that can be seen. Measured.
+#: Passes of k-means; more change nothing visible. Measured.
 PASSES = 20
 
-#: Halvings of the width of the intervals of `even_codebook`: to a millionth of the range. Chosen.
+#: Halvings of the width of the intervals of `even_codebook`, to a millionth of the range. Chosen.
 BISECTIONS = 20
 
 
@@ -68,17 +62,14 @@ def encode_center(center: FloatArray, low: Wide, high: Wide) -> Words:
 
 
 def center_table(low: Wide, high: Wide) -> FloatArray:
-    """Return (3, 65536) coordinates of each word, between (3,) ends of `sign_log`.
-
-    Largest error: half a step of `sign_log`, of (high - low) / 65535.
-    """
+    """Return the (3, 65536) coordinates of words between (3,) ends of `sign_log`; error at most half a step of that."""
     logs = quantize.range_table(low, high, LAST_WORD + 1)
     with np.errstate(over="ignore"):
         return np.copysign(np.expm1(np.abs(logs)), logs).astype(np.float32, order="C")
 
 
 def encode_quat(quat_xyzw: FloatArray) -> Bytes:
-    """Encode (N, 4) unit quaternions as (N, 4) bytes: all components but the largest, from w x y z, and its tag."""
+    """Encode (N, 4) unit quaternions as (N, 4) bytes: the three smaller components of w x y z, and a tag."""
     wxyz = quat_xyzw[:, [3, 0, 1, 2]]
     largest = np.abs(wxyz).argmax(axis=1)[:, None]
     flip = np.where(np.take_along_axis(wxyz, largest, axis=1) < 0, np.float32(-1), np.float32(1))
@@ -90,10 +81,7 @@ def encode_quat(quat_xyzw: FloatArray) -> Bytes:
 
 
 def quat_components() -> FloatArray:
-    """Return (256,) components of a rotation by their bytes, for `texels.fill_quats`.
-
-    Largest error: 1.1 degrees of rotation.
-    """
+    """Return the (256,) components of rotations by their bytes; error at most 1.1 degrees of rotation."""
     return (np.arange(256, dtype=np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5))
 
 
@@ -101,9 +89,9 @@ def codebook(values: FloatArray, tilt: float = 0) -> FloatArray:
     """Choose a codebook for numbers.
 
     If at most 256 of them differ, the book has just these. Otherwise it has the least and the largest number, so that
-    the range stays, and between them the means that k-means finds in one dimension, where it needs no more than sums up
-    to the boundaries of its cells. It starts from a density of codes in proportion to the cube root of that of the
-    weight, which has the least squared error where codes are many (P. F. Panter and W. Dite, 1951).
+    the range stays, and between them means of k-means in one dimension, which needs only sums up to the boundaries of
+    its cells. It starts from a density of codes in proportion to the cube root of that of the weight, which has the
+    least squared error for many codes (P. F. Panter and W. Dite, 1951).
 
     Args:
         values: finite float32 of any shape, at least one.
@@ -127,10 +115,10 @@ def codebook(values: FloatArray, tilt: float = 0) -> FloatArray:
 
 
 def even_codebook(values: FloatArray) -> FloatArray:
-    """Choose the book with the least largest error: the middles of intervals of one width, which cover all numbers.
+    """Choose the book with the least maximum error: the middles of equally wide intervals that cover all numbers.
 
     Args:
-        values: finite float32 of any shape, more than 256 of which differ.
+        values: finite float32 of any shape, with more than 256 different ones.
 
     Returns:
         (256,) ascending float32. The first one is the least value, such as the logarithm of 0; the last one is repeated
@@ -149,7 +137,7 @@ def even_codebook(values: FloatArray) -> FloatArray:
 
 
 def _starts(ordered: NDArray[np.float64], width: float) -> list[int]:
-    """Return where the intervals begin that cover ascending numbers; at most as many as there are codes."""
+    """Return the starts of intervals that cover ascending numbers, at most `CODES` of them."""
     starts = [0]
     while len(starts) < CODES:
         end = int(np.searchsorted(ordered, ordered[starts[-1]] + width, "right"))
@@ -160,13 +148,13 @@ def _starts(ordered: NDArray[np.float64], width: float) -> list[int]:
 
 
 def nearest(values: FloatArray, book: FloatArray) -> NDArray[np.uint8]:
-    """Return the code of each float32 number in a book, the first of those that are equally near; of any shape."""
+    """Return the nearest code of a book for each number, the first of equally near ones; any shape."""
     wide = book.astype(np.float64)
     return np.searchsorted((wide[1:] + wide[:-1]) / 2, values.ravel()).astype(np.uint8).reshape(values.shape)
 
 
 def _means(ordered: NDArray[np.float64], codes: int, tilt: float) -> NDArray[np.float64]:
-    """Return (codes,) ascending means of cells of ascending numbers, more than codes of which differ."""
+    """Return (codes,) ascending means of cells of ascending numbers; more than `codes` numbers must differ."""
     low, extent = ordered[0], ordered[-1] - ordered[0]
     bins = np.minimum((ordered - low) * (BINS / extent), BINS - 1).astype(np.int64)
     counts = np.bincount(bins, minlength=BINS).astype(np.float64)
@@ -187,9 +175,7 @@ def _means(ordered: NDArray[np.float64], codes: int, tilt: float) -> NDArray[np.
     return means
 
 
-Texels = NDArray[np.uint8]
-
-#: Effort of the encoder: quality sets how long it searches for repetitions, the method how many ways of coding it
+#: Effort of the WebP encoder: quality sets how long it searches for repetitions, the method how many ways of coding it
 #: tries. Measured: with more, files get smaller by less than 0.3 % and take up to ten times as long.
 QUALITY, METHOD = 50, 1
 
@@ -199,21 +185,18 @@ MAX_SIDE = 16_383
 #: (N,) A R G B from the most significant byte.
 Pixels = NDArray[np.uint32]
 
-#: Reads the next `size` bytes, or fewer, of which none are left at the end.
+#: Reads the next `size` bytes, or fewer; none at the end.
 Read = Callable[[int], bytes]
 
-#: Bytes that are read first: the header of the file, that of its first chunk, and the sides.
+#: Bytes that are read first: the headers of the file and of its first chunk, and the sides.
 START = 30
 
-#: Most chunks that are read before that of the pixels: a colour profile, alpha, and some that are unknown.
+#: Most chunks that are read before the pixels: a colour profile, alpha, and some unknown ones.
 MOST_BEFORE = 16
-
-#: Flag of a WebP file's extended header.
-ANIMATED = 2
 
 
 class WebPHeader(NamedTuple):
-    """First bytes of a WebP file, `start`, and the facts on its pixels in them."""
+    """First bytes of a WebP file, `start`, and their facts on its pixels."""
 
     start: bytes
     width: int
@@ -222,11 +205,11 @@ class WebPHeader(NamedTuple):
 
 
 def read_header(read: Read, name: str) -> WebPHeader:
-    """Read the header of a still WebP image: its first chunk; in an extended file, all chunks up to the pixels."""
+    """Read the header of a still WebP image; in an extended file, all chunks up to the pixels."""
     data = read(START)
     kind = data[12:16] if data[:4] == b"RIFF" and data[8:12] == b"WEBP" and len(data) == START else b""
     if kind == b"VP8X":  # 24 bits each, minus one
-        if data[20] & ANIMATED:
+        if data[20] & 2:
             raise FormatError(f"{quoted_value(name)} is an animation, but SOG needs a still image")
         sides = int.from_bytes(data[24:27], "little"), int.from_bytes(data[27:30], "little")
         data, lossy = _up_to_pixels(data, read)
@@ -241,7 +224,7 @@ def read_header(read: Read, name: str) -> WebPHeader:
 
 
 def _up_to_pixels(data: bytes, read: Read) -> tuple[bytes, bool]:
-    """Read the chunks up to the pixels; return all bytes so far, and whether the pixels are lossy."""
+    """Read the chunks up to the pixels; return all bytes read, and whether the pixels are lossy."""
     for _ in range(MOST_BEFORE):
         head = read(8)
         data += head
@@ -253,9 +236,10 @@ def _up_to_pixels(data: bytes, read: Read) -> tuple[bytes, bool]:
 
 
 def pixels_of(header: WebPHeader, read: Read, name: str) -> Pixels:
-    """Return (width * height,) pixels, row by row, of a file whose sides are in bounds: libwebp allocates them.
+    """Decode (width * height,) pixels, row by row, which libwebp allocates: check the sides before.
 
-    `read` returns the bytes after the header.
+    Args:
+        read: reads the bytes after the header.
     """
     data = header.start + b"".join(iter(lambda: read(PIECE), b""))
     try:
@@ -268,7 +252,7 @@ def pixels_of(header: WebPHeader, read: Read, name: str) -> Pixels:
 
 
 def encode_webp(image: Texels) -> bytes:
-    """Encode a file of (height, width, 3 or 4) texels, which keeps colours of alpha 0."""
+    """Encode (height, width, 3 or 4) texels without losses, even of colours with alpha 0."""
     file = io.BytesIO()
     Image.fromarray(image).save(file, "WEBP", lossless=True, exact=True, quality=QUALITY, method=METHOD)
     return file.getvalue()

@@ -1,4 +1,4 @@
-"""The properties of RAD's chunks, and their encodings: pairs of encode and decode over a whole column of a chunk.
+"""Properties of RAD's chunks, and their encodings: pairs of encode and decode of a whole column of a chunk.
 
 A column is stored number by number: all x, then all y, then all z. The formulas are those of Spark 2.2.0's `rad.rs`.
 """
@@ -20,19 +20,16 @@ from ..formats import RAD_ENCODINGS
 from ..quantize import Bytes
 from ..spark_codings import STEPS_8_8_8
 
-#: The compression of properties: a raw deflate stream, whatever its name says.
+#: Compression of properties: a raw deflate stream, despite its name.
 GZ = "gz"
 
-#: Largest finite float16. Larger values are clamped to it: rounded they would be infinite.
-LARGEST_F16 = np.float32(65504)
+#: Largest finite float16, to which larger values are clamped; and the largest one whose exponential float32 holds.
+LARGEST_F16, LARGEST_LOG_F16 = np.float32(65504), np.float16(88.6875)
 
-#: Largest float16 whose exponential float32 holds, a step below `quantize.LARGEST_LOG`.
-LARGEST_LOG_F16 = np.float16(88.6875)
-
-#: Splats that are coded at a time: they and what is computed of them stay in the processor's cache.
+#: Splats that are coded at a time, with their intermediate results in the processor's cache.
 BLOCK = 1 << 13
 
-#: Every code of a byte.
+#: All codes of a byte.
 _ALL = np.arange(256, dtype=np.uint8)
 
 
@@ -40,10 +37,10 @@ class PropertyCoding(NamedTuple):
     """Encoding of a property.
 
     Attributes:
-        encode: (N, numbers) values, and the ends of the range of their codes, to bytes of any shape.
-        decode: the bytes, N, the numbers of a splat, and the ends of the range to (N, numbers) values.
+        encode: function of (N, numbers) values and the ends of the range of codes; returns codes of any shape.
+        decode: function of the bytes, N, numbers of a splat and the ends of the range; returns (N, numbers) values.
         size: bytes of a number.
-        ends: keys of a property that it needs, for the range of its codes.
+        ends: keys of a property that define the range of its codes.
     """
 
     encode: Callable[[NDArray[Any], float, float], NDArray[Any]]
@@ -52,13 +49,13 @@ class PropertyCoding(NamedTuple):
     ends: tuple[str, ...] = ()
 
     def rounded(self, values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
-        """Return (N, numbers) values as they are decoded."""
+        """Encode and decode (N, numbers) values."""
         codes = np.ascontiguousarray(self.encode(values, low, high)).reshape(-1).view(np.uint8)
         return np.ascontiguousarray(self.decode(codes, len(values), values.shape[1], low, high))
 
 
 def _plain(code: str, most: np.float32 | None = None) -> PropertyCoding:
-    """Return the coding of plain numbers of a type."""
+    """Return the coding of plain numbers of a type; `most` clamps their magnitude."""
 
     def encode(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
         planes = values.T if most is None else np.clip(values.T, -most, most)
@@ -71,7 +68,7 @@ def _plain(code: str, most: np.float32 | None = None) -> PropertyCoding:
 
 
 def _by_bytes(coding: PropertyCoding) -> PropertyCoding:
-    """Return the coding of numbers of another coding with their lowest bytes first, then their next ones."""
+    """Return a coding with the lowest bytes of all numbers first, then their next bytes."""
     size = coding.size
 
     def encode(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
@@ -86,7 +83,7 @@ def _by_bytes(coding: PropertyCoding) -> PropertyCoding:
 
 
 def _by_differences(coding: PropertyCoding) -> PropertyCoding:
-    """Return the coding of bytes of another coding as differences from those of the splat before, modulo 256."""
+    """Return a coding of differences from the bytes of the splat before, modulo 256."""
 
     def encode(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
         planes = coding.encode(values, low, high)
@@ -104,7 +101,7 @@ def _by_table(
     table: Callable[[float, float], FloatArray],
     ends: tuple[str, ...] = ("min", "max"),
 ) -> PropertyCoding:
-    """Return the coding of a byte a number; the table has the values of all 256."""
+    """Return a coding with a byte for a number; `table` returns the values of all 256 by the ends of the range."""
 
     def encode_planes(values: FloatArray, low: float, high: float) -> NDArray[Any]:
         planes = np.empty((values.shape[1], len(values)), np.uint8)
@@ -113,14 +110,14 @@ def _by_table(
         return planes
 
     def decode(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
-        with np.errstate(over="ignore", invalid="ignore"):  # a stranger's range may be any
+        with np.errstate(over="ignore", invalid="ignore"):  # files may have any range
             values = table(low, high)
         return values[codes.reshape(numbers, count).T]
 
     return PropertyCoding(encode_planes, decode, 1, ends)
 
 
-@np.errstate(over="ignore")  # values may be any number of times the end of the range
+@np.errstate(over="ignore")  # values may be far beyond the range
 def _encode_signed(values: FloatArray, low: float, high: float) -> NDArray[Any]:
     steps = values / np.float32(high)
     steps *= np.float32(127)
@@ -135,7 +132,7 @@ def _encode_log(values: NDArray[Any], low: float, high: float) -> NDArray[Any]:
 
 
 def _decode_log_f16(codes: Bytes, count: int, numbers: int, low: float, high: float) -> NDArray[Any]:
-    with np.errstate(over="ignore", invalid="ignore"):  # a stranger's logarithm may be any
+    with np.errstate(over="ignore", invalid="ignore"):  # files may have any logarithms
         return np.exp(_F16.decode(codes, count, numbers, low, high).astype(np.float32))
 
 
@@ -156,10 +153,10 @@ _F32, _F16 = _plain("<f4"), _plain("<f2", LARGEST_F16)
 _R8 = _by_table(spark_codings.encode_linear, functools.partial(spark_codings.decode_linear, _ALL))
 _S8 = _by_table(_encode_signed, lambda low, high: _ALL.view(np.int8) / np.float32(127) * np.float32(high), ("max",))
 
-#: By name. Largest errors inside the range of the codes, apart from that of float32:
+#: Encodings by name. Largest errors inside the range of the codes, apart from that of float32:
 #: f16, f16_lebytes: 2 ** -11 of a number, or 2 ** -25 if that is more. r8, r8_delta: (max - min) / 510.
 #: s8, s8_delta: max / 254. ln_0r8: a factor of e ** ((max - min) / 508). ln_f16: a factor of e ** (2 ** -11 *
-#: abs(ln(scale))). oct88r8, which takes and gives whole quaternions and is stored splat by splat: 1.94 degrees.
+#: abs(ln(scale))). oct88r8, of whole quaternions, stored splat by splat: 1.94 degrees.
 CODINGS = {
     "f32": _F32,
     "f16": _F16,
@@ -180,14 +177,14 @@ CODINGS = {
 
 
 class Row(NamedTuple):
-    """A property.
+    """Description of a property.
 
     Attributes:
-        option: the field of `RadOptions` that chooses its encoding; empty where there is no choice.
-        column: of `Splats` or `LodTree`; "labels" for those of the palette.
-        numbers: of a splat.
-        encodings: that it may be in; the first is the one that Spark writes.
-        degree: of spherical harmonics; 0 for other properties.
+        option: field of `RadOptions` that chooses its encoding; empty without a choice.
+        column: column of `Splats` or `LodTree`; "labels" for labels of the palette.
+        numbers: numbers of a splat.
+        encodings: allowed encodings; Spark writes the first.
+        degree: degree of spherical harmonics; 0 for other properties.
         codes: whether it is a part of the palette of spherical harmonics, which only the first chunk has.
     """
 
@@ -200,7 +197,7 @@ class Row(NamedTuple):
     codes: bool = False
 
 
-#: In the order of a chunk.
+#: Properties in the order of a chunk.
 PROPERTIES = (
     Row("center", "center", "center", 3, RAD_ENCODINGS["center"]),
     Row("alpha", "alpha", "opacity", 1, RAD_ENCODINGS["alpha"]),
@@ -223,12 +220,12 @@ BY_NAME = {row.name: row for row in PROPERTIES}
 
 @dataclass(frozen=True)
 class Property:
-    """A column of a chunk.
+    """Stored property of a chunk.
 
     Attributes:
-        offset: from the beginning of the payload.
-        name: one of `PROPERTIES`, or unknown.
-        encoding: one of `CODINGS`, or unknown.
+        offset: position in the payload.
+        name: a name of `PROPERTIES`, or an unknown one.
+        encoding: a name of `CODINGS`, or an unknown one.
         min, max: ends of the range of the codes; None without a range.
     """
 
@@ -242,5 +239,5 @@ class Property:
 
 
 def encodings_of(properties: Iterable[Property]) -> dict[str, str]:
-    """Return the encodings of a chunk's properties, by the field of `RadOptions`."""
+    """Return the encodings of properties by the field of `RadOptions`."""
     return {BY_NAME[each.name].option: each.encoding for each in properties if BY_NAME[each.name].option}

@@ -1,6 +1,6 @@
 """RAD, the file of Spark 2 whose Level-of-Detail tree a viewer streams in chunks of 65,536 nodes.
 
-A file is a header and its chunks, or a header that names a file for each chunk; `docs/formats/rad.md` lays them out.
+A file is a header and its chunks, or a header that names a file for each chunk; `docs/formats/rad.md` describes both.
 """
 
 from __future__ import annotations
@@ -36,54 +36,47 @@ from .rad_header import Files, RadChunkHeader, RadHeader, in_files, in_one_file,
 from .rad_reader import RadReader as RadReader
 from .rad_reader import open_content as open_content
 
-#: What "auto" stands for, where the scene does not decide.
+#: Encodings for "auto" if nothing in the scene demands others.
 AUTOMATIC = RadOptions("f32_lebytes", "r8", "r8", "ln_0r8", "oct88r8", "s8")
 
 #: Encodings of centres as float16.
 HALF = ("f16", "f16_lebytes")
 
-#: Range of logarithms of scales from which float16 is used: steps of a byte would be as coarse as SPZ's, 6 %.
-WIDE_LOG_RANGE = 16.0
+#: Ranges of logarithms of scales and of colours from which float16 is used: steps of a byte would be as coarse as SPZ's
+#: scales, 6 %, or 4 steps of 8-bit colour.
+WIDE_LOG_RANGE, WIDE_RGB_RANGE = 16.0, 4.0
 
-#: Splats are long if they are as many times as long as wide. Where half of them are, rotations are float16: those of
+#: Ratio of length and width from which a splat is long. If half of the splats are, rotations are float16: those of
 #: oct88r8, off by up to 1.9 degrees, would move the ends of each by a quarter of its width.
 LONG = 8.0
 
-#: Range of colours from which float16 is used: a code would be 4 steps of 8-bit colour and more.
-WIDE_RGB_RANGE = 4.0
-
 #: Least range of codes of SH in a file: their steps of 1 / 127 are below what colours of 8 bits show, and finer ones
-#: take more room. The splatEncoding of the header has the fitted range all the same, since a viewer that packs SH into
-#: 6 to 8 bits takes that.
+#: take more room. The splatEncoding of the header still has the fitted range, by which viewers pack SH into 6 to 8
+#: bits.
 LEAST_SH_MAX = 1.0
 
-
-#: The statistics that ranges are fitted to.
-NEEDED = frozenset(("rgb", "scale", "sh"))
-
 #: Range of the logarithms of scales up to which none is clamped: 254 steps of 4.7 % at most. Beyond, the smallest
-#: `SMALL_QUANTILE` of the scales may be; those are flat splats' thicknesses.
+#: `SMALL_QUANTILE` of the scales, thicknesses of flat splats, may be clamped.
 LOG_RANGE = 12.0
 
 #: Ranges end at multiples of this, so that their numbers are short and exact.
 GRID = 1 / 64
 
-#: An error of a colour or a coefficient from which more is no worse: a colour is then a wrong one. Otherwise a single
-#: splat far from all others would decide the steps of all.
+#: Cap on the error of a colour or a coefficient, whose colour is wrong anyway. Otherwise a single splat far from all
+#: others would decide the steps of all.
 WORST = 0.5
 
-#: Ends of ranges that are tried, as shares of the values that lie beyond.
+#: Shares of values beyond the ends of ranges that are tried.
 BEYOND = np.array([0.0, 1e-4, 3e-4, 1e-3, 3e-3, 1e-2])
 
 
 def needed(options: WriteOptions) -> frozenset[str]:
-    """Return the statistics by which `settled` settles these options."""
+    """Return the names of the statistics that `settled` needs for these options."""
     rad = options.rad
-    ranges = NEEDED if rad.ranges is None else frozenset[str]()
-    rounds = {"leaf_scale"} if rad.center == AUTO and rad.center_bits is None else set()
-    turns = {"leaf_length"} if rad.orientation == AUTO else set()
-    reach = {"reach"} if rad.center in HALF else set()
-    return ranges | rounds | turns | reach
+    names = {"rgb", "scale", "sh"} if rad.ranges is None else set[str]()
+    names |= {"leaf_scale"} if rad.center == AUTO and rad.center_bits is None else set()
+    names |= {"leaf_length"} if rad.orientation == AUTO else set()
+    return frozenset(names | ({"reach"} if rad.center in HALF else set()))
 
 
 def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
@@ -93,10 +86,8 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
     if statistics.count >= 1 << 32:
         raise FormatError(f"{statistics.count:,} splats; RAD numbers at most {(1 << 32) - 1:,}")
     if rad.center in HALF and np.float16(min(statistics.reach or 0, LARGEST_F16)) >= LARGEST_F16:
-        raise FormatError(
-            f"coordinates reach {statistics.reach:.6g}, and {rad.center} holds less than {LARGEST_F16:.0f};"
-            " choose another encoding of centres, such as f32"
-        )
+        text = f"coordinates reach {statistics.reach:.6g}, and {rad.center} holds less than {LARGEST_F16:.0f}"
+        raise FormatError(f"{text}; choose another encoding of centres, such as f32")
     ranges = rad.ranges or fitted(statistics)
     encodings = {name: getattr(rad, name) for name in RAD_ENCODINGS}
     chosen = {name: getattr(AUTOMATIC, name) if value == AUTO else value for name, value in encodings.items()}
@@ -108,13 +99,13 @@ def settled(scene: Scene | Statistics, options: WriteOptions) -> WriteOptions:
         chosen["orientation"] = "f16"
     bits = rad.center_bits
     if rad.center == AUTO and bits is None:
-        # The lowest bytes of rounded float32 are mostly zeros, which take no room.
+        # The lowest bytes of rounded float32 are mostly zeros, which compress to nothing.
         bits = min(fine_bits(statistics.values["leaf_scale"]), EXACT_BITS)
     return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, center_bits=bits, ranges=ranges))
 
 
 def code_range(row: Row, ranges: SplatEncoding) -> tuple[float, float]:
-    """Return the range of a property's codes in a file; (0, 0) where it has none."""
+    """Return the range of the codes of a property; (0, 0) if they have none."""
     if row.degree:
         most = max(LEAST_SH_MAX, float(ranges.sh_max(row.degree)))
         return -most, most
@@ -127,7 +118,7 @@ def code_range(row: Row, ranges: SplatEncoding) -> tuple[float, float]:
 
 
 def held(options: WriteOptions, sh_degree: int) -> list[CodeRange]:
-    """Return the values that a file of this SH degree holds with these settled options without clamping them."""
+    """Return the ranges beyond which a file of this SH degree clamps values, by its settled options."""
     rad, ranges, most = options.rad, [], float(LARGEST_F16)
     for row in PROPERTIES:
         encoding = getattr(rad, row.option) if row.option else ""
@@ -142,13 +133,13 @@ def held(options: WriteOptions, sh_degree: int) -> list[CodeRange]:
         elif encoding and CODINGS[encoding].ends:
             half = (high - low) / (508 if encoding.startswith("s8") else 510)
             ranges.append(CodeRange(row.column, low - half, high + half, numbers, degree=row.degree))
-        elif encoding in ("f16", "f16_lebytes"):
+        elif encoding in HALF:
             ranges.append(CodeRange(row.column, -most, most, numbers, degree=row.degree))
     return ranges
 
 
 def fitted(statistics: Statistics) -> SplatEncoding:
-    """Return the ranges that suit splats in any order: what clamping and rounding cost together is least."""
+    """Return the ranges with the least error of clamping and rounding together, whatever the order of splats."""
     rgb_min, rgb_max = _linear_range(statistics.values["rgb"])
     low, high = _log_range(statistics.values["scale"])
     sh_max = dict.fromkeys(("sh1_max", "sh2_max", "sh3_max"), 1.0)
@@ -169,7 +160,7 @@ def _clamping(counts: NDArray[np.int64], top: float) -> float:
 
 
 def _linear_range(values: Distribution) -> tuple[float, float]:
-    """Return the range of 255 steps with the least squared error, of rounding and of clamping together."""
+    """Return the range of 255 steps with the least squared error of rounding and clamping."""
     total, negative, positive = max(values.count, 1), values.magnitudes(-1), values.magnitudes(1)
     below = tops(negative, total, -values.lowest, BEYOND)
     above = np.maximum(tops(positive, total, values.highest, BEYOND), 1)
@@ -198,7 +189,7 @@ def _largest(values: Distribution) -> float:
 
 
 def _log_range(scale: Distribution) -> tuple[float, float]:
-    """Return the logarithms of a small and of the largest scale: sizes of coarse splats must not be clamped."""
+    """Return the range of logarithms of scales, up to the largest: sizes of coarse splats must not be clamped."""
     counts = scale.magnitudes(1)
     counts[(UPPER <= SCALE_ZERO) | ~np.isfinite(LOWER)] = 0
     bins = np.flatnonzero(counts)
@@ -213,24 +204,15 @@ def _log_range(scale: Distribution) -> tuple[float, float]:
     return low, high if high > low else low + GRID
 
 
-#: Bytes of chunks that wait in memory for their header; beyond, they wait on disk.
+#: Largest size of chunks in bytes that wait in memory for their header; larger ones wait on disk.
 SPOOLED = 1 << 26
 
 #: Names of the arrays of a window's result: the bytes of a chunk, and their number.
 CHUNK, SIZE = "chunk", "size"
 
-_RAW = -zlib_ng.MAX_WBITS
-
-#: The largest float32 below 1.
-_BELOW_1 = np.nextafter(np.float32(1), np.float32(0))
-
-
-#: Nodes that the palette of a tree is made of which is not in memory, evenly spread; a tree of fewer gives all. Of 16
-#: times as many as codes. Chosen.
-SAMPLE = 1 << 20
-
-#: Consecutive nodes of a sample, so that reading it takes few reads. Chosen.
-RUN = 1 << 8
+#: Largest number of nodes that the palette of a tree on disk is made of, 16 times as many as codes; and number of
+#: consecutive ones among them, so that reading them takes few reads. Chosen.
+SAMPLE, RUN = 1 << 20, 1 << 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,8 +221,8 @@ class Palette:
 
     Attributes:
         codes: (codes, K, 3) coefficients, as many codes as the first chunk has splats: Spark reads no other number.
-        used: codes in use; the others, behind them, are 0.
-        labels: (N,) the code of each splat; None if it is searched for in each chunk.
+        used: number of codes in use; the rest are 0.
+        labels: (N,) code of each splat; None to search for the codes of each chunk.
     """
 
     codes: FloatArray
@@ -249,11 +231,15 @@ class Palette:
 
     @classmethod
     def of(cls, scene: Scene | Reader, most: int, threads: int, progress: Progress) -> Palette:
-        """Cluster the SH of a scene to at most `most` codes; zeros follow, up to as many as Spark reads."""
+        """Cluster the SH of a scene to at most `most` codes, padded with zeros to the number that Spark reads."""
         if isinstance(scene, Scene):
             splats, count = scene.splats, len(scene)
         else:
-            splats, count = _sample(scene), scene.count
+            count, runs = scene.count, [0]
+            step = count if count <= SAMPLE else RUN
+            if count > SAMPLE:
+                runs = np.linspace(0, count - RUN, SAMPLE // RUN).astype(np.int64).tolist()
+            splats = Splats.concat([scene.read(start, start + step)[0] for start in runs])
         room = min(count, CHUNK_NODES)
         weight = sh_palette.visible_weight(splats)
         found = sh_palette.cluster(splats.sh, min(most, room), weight=weight, threads=threads, progress=progress)
@@ -262,18 +248,10 @@ class Palette:
         return cls(padded, len(found.codes), found.labels if len(splats) == count else None)
 
     def labels_of(self, splats: Splats, start: int) -> NDArray[np.uint32]:
-        """Return (n,) the codes of the splats of the file from number `start` on."""
+        """Return (n,) codes of the splats of the file from number `start` on."""
         if self.labels is not None:
             return self.labels[start : start + len(splats)]
         return sh_palette.labels_of(splats.sh, self.codes[: self.used])
-
-
-def _sample(nodes: Reader) -> Splats:
-    """Read runs of nodes, evenly spread over all."""
-    if nodes.count <= SAMPLE:
-        return nodes.read(0, nodes.count)[0]
-    starts = np.linspace(0, nodes.count - RUN, SAMPLE // RUN).astype(np.int64)
-    return Splats.concat([nodes.read(start, start + RUN)[0] for start in starts.tolist()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,11 +259,11 @@ class RadEncoder:
     """`encoder.Encoder` of a file: the result of a window is a chunk.
 
     Attributes:
-        header: of the file, but for its chunks.
+        header: header of the file, without chunks.
         codes: ranges of codes.
-        palette: of SH; None for coefficients of each splat.
-        stored: chunks of a file whose codes are kept, see `unchanged`.
-        unchanged: (N,) nodes that get their codes of `stored`, where the encoding is the same; None for none.
+        palette: SH palette; None to store the coefficients of each splat.
+        stored: chunks of an earlier file.
+        unchanged: (N,) nodes that keep their codes in `stored` if the encoding is the same; None for no node.
     """
 
     header: RadHeader
@@ -297,7 +275,6 @@ class RadEncoder:
     unchanged: NDArray[np.bool_] | None = None
 
     def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
-        """Encode a chunk: its bytes, and their number."""
         chunk = np.frombuffer(self._chunk(splats, tree, start), np.uint8)
         encoded = {CHUNK: chunk, SIZE: np.array([len(chunk)])}
         if self.ranges:
@@ -305,17 +282,17 @@ class RadEncoder:
         return encoded
 
     def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
-        """Return the bytes of one file, piece by piece."""
+        """Yield the bytes of one file from the results of all windows."""
         numbers = range(len(windows_of(self.header.count)))
         sizes = [int(windows(number, SIZE)[0]) for number in numbers]
         yield from self.one_file(sizes, (windows(number, CHUNK).tobytes() for number in numbers), progress)
 
     def one_file(self, sizes: Sequence[int], chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
-        """Return the bytes of one file, piece by piece, of the sizes and the bytes of its chunks."""
+        """Yield the bytes of one file from the sizes and the bytes of its chunks."""
         return in_one_file(self.header, sizes, self._counted(chunks, progress))
 
     def files(self, chunks: Iterable[bytes], stem: str, *, progress: Progress = silent) -> Files:
-        """Return the name and the bytes of each file, one for each of the chunks; see `rad_header.in_files`."""
+        """Yield the name and the bytes of a file for each chunk, and of the header; see `rad_header.in_files`."""
         return in_files(self.header, self._counted(chunks, progress), stem)
 
     def _counted(self, chunks: Iterable[bytes], progress: Progress) -> Iterator[bytes]:
@@ -337,16 +314,16 @@ class RadEncoder:
         return b"".join([pack_chunk_header(header), *payload])
 
     def keeping(self, stored: Sequence[StoredChunk], unchanged: NDArray[np.bool_]) -> RadEncoder:
-        """Return an encoder that gives (N,) `unchanged` nodes their codes of a file, where its encoding is the same."""
+        """Return an encoder that keeps the stored codes of (N,) `unchanged` nodes if the encoding is the same."""
         return dataclasses.replace(self, stored=stored, unchanged=unchanged)
 
     def _coded(
         self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
     ) -> tuple[str, NDArray[Any], float | None, float | None]:
-        """Encode a property of the chunk that begins with node `start`.
+        """Encode a property of the chunk that begins with node `start`, without compression.
 
         Returns:
-            its encoding; codes of any shape, which are not compressed; and the ends of their range, None without one.
+            the encoding; codes of any shape; and the ends of their range, None without one.
         """
         encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
         coding, stop = CODINGS[encoding], start + len(splats)
@@ -365,7 +342,7 @@ class RadEncoder:
         return encoding, flat, each.min, each.max
 
     def _former(self, name: str, start: int, stop: int) -> tuple[Property, Bytes] | None:
-        """Return a property of some nodes and (n, ...) their codes; None where its coding differs between chunks."""
+        """Return the stored coding of a property of nodes and their (n, ...) codes; None if chunks differ in coding."""
         found, codes = [], []
         for chunk in self.stored:
             own = chunk.codes.get(name)
@@ -394,7 +371,7 @@ class RadEncoder:
     def values(
         self, row: Row, encoding: str, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None
     ) -> NDArray[Any]:
-        """Return (n, numbers) values of a property, as its encoding takes them."""
+        """Return the (n, numbers) values of a property for its encoding."""
         if row.degree:
             source = splats.sh if self.palette is None else self.palette.codes
             flat = source.reshape(len(source), 3 * source.shape[1])
@@ -406,8 +383,8 @@ class RadEncoder:
         if row.column == "opacity":
             alpha = spark_codings.encode_lod_alpha(self._opacity(splats))
             if encoding == "r8" and self.codes.lod_opacity:
-                # As a code, 1 of 0..2 lies between two of them, and must not become the upper one, of a merged splat.
-                alpha = np.where(alpha == 1, _BELOW_1, alpha)
+                # 1 of 0..2 lies between two codes, and must not become the upper one, that of a merged splat.
+                alpha = np.where(alpha == 1, np.nextafter(np.float32(1), np.float32(0)), alpha)
             return alpha[:, None]
         if row.column == "quat_xyzw" and encoding != "oct88r8":
             return column[:, :3] * np.where(column[:, 3:] < 0, np.float32(-1), np.float32(1))
@@ -416,7 +393,7 @@ class RadEncoder:
         return column if column.ndim == 2 else column[:, None]
 
     def _opacity(self, splats: Splats) -> FloatArray:
-        """Return (n,) opacities that make up for the rounding of scales."""
+        """Return (n,) opacities that compensate for the rounding of scales."""
         if not self.options.covering:
             return splats.opacity
         ends = code_range(BY_NAME["scales"], self.codes)
@@ -429,11 +406,10 @@ class RadEncoder:
         return kept
 
     def _deflated(self, codes: NDArray[Any], encoding: str) -> bytes:
-        # Of codes of a byte, only runs are searched for: longer matches are chance, and make streams longer and slower.
+        # Codes of one byte have runs only: longer matches are chance, and make streams longer and slower.
         strategy = zlib_ng.Z_RLE if CODINGS[encoding].size == 1 else zlib_ng.Z_DEFAULT_STRATEGY
-        packer = zlib_ng.compressobj(
-            self.options.compression_level, zlib_ng.DEFLATED, _RAW, zlib_ng.DEF_MEM_LEVEL, strategy
-        )
+        level, raw = self.options.compression_level, -zlib_ng.MAX_WBITS
+        packer = zlib_ng.compressobj(level, zlib_ng.DEFLATED, raw, zlib_ng.DEF_MEM_LEVEL, strategy)
         return packer.compress(codes.data.cast("B")) + packer.flush()
 
 
@@ -445,10 +421,7 @@ def encoder(
     threads: int = 1,
     progress: Progress = silent,
 ) -> RadEncoder:
-    """Return the encoder of a scene, of which only the splats for a palette are read.
-
-    With `counting`, it counts the values that it clamps.
-    """
+    """Return the encoder of a scene, by reading only the splats for a palette; `counting` counts clamped values."""
     codes, most, palette = options.rad.ranges, options.rad.sh_codes, None
     if codes is None:
         raise ValueError("the options leave choices open; `settled` makes them")
@@ -466,7 +439,7 @@ def encoder(
 
 def rounded(center: FloatArray, bits: int) -> FloatArray:
     """Round centres to multiples of 2 ** -bits that float32 holds."""
-    # A float, as numpy 1 makes objects of large integers.
+    # A float, since numpy 1 makes objects of large integers.
     most = float(math.floor(math.ldexp(float(np.finfo(np.float32).max), bits)))
     multiples = np.rint(np.ldexp(center.astype(np.float64), bits)).clip(-most, most)
     return np.ldexp(multiples, -bits).astype(np.float32)
@@ -475,10 +448,9 @@ def rounded(center: FloatArray, bits: int) -> FloatArray:
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """Return the bytes of one file, piece by piece; chunks wait in a temporary file for the header, which has sizes.
+    """Encode one file piece by piece; chunks wait in a temporary file for the header, which has their sizes.
 
-    The same scene and options give the same bytes for any number of threads. Nodes keep their order; that of
-    `lod.chunk_order` is for streaming.
+    The same scene and options give the same bytes for any number of threads. Nodes keep their order.
     """
     of_scene = encoder(scene, settled(scene, options), threads=threads, progress=progress)
     with tempfile.SpooledTemporaryFile(SPOOLED) as file:
@@ -501,7 +473,7 @@ class StoredChunk:
     """Codes of a chunk whose first node is `start`.
 
     Attributes:
-        codes: (n, ...) of the properties of splats, by name: the bytes of each splat, of differences their sums.
+        codes: (n, ...) bytes of each splat by the name of the property, after summing up differences.
     """
 
     start: int
@@ -510,9 +482,9 @@ class StoredChunk:
 
 
 def _like(header: RadHeader, first: Mapping[str, Property], options: WriteOptions) -> WriteOptions:
-    """Return the options, and where they leave a choice open, that of the first chunk of a file, by its properties.
+    """Return the options with open choices set as in the first chunk of a file.
 
-    The rounding of centres stays open where the encoding is that of "auto": it matters for merged splats.
+    The rounding of centres stays open if their encoding is that of "auto": it matters for merged splats.
     """
     rad, found = options.rad, encodings_of(first.values())
     if found.get("center") == AUTOMATIC.center:
@@ -528,11 +500,7 @@ def _like(header: RadHeader, first: Mapping[str, Property], options: WriteOption
 
 
 def stored(source: OpenFile, options: WriteOptions) -> tuple[list[StoredChunk], WriteOptions]:
-    """Read the codes of a file and of the files that it names.
-
-    Returns:
-        the codes, and the options, which have the file's value where they leave a choice open.
-    """
+    """Read the codes of a file; return them and the options with open choices set as in the file."""
     reader, chunks = RadReader.open(source.file, source.open_companion), []
     for packed in map(reader.packed, range(len(reader.header.chunks))):
         count, properties = packed.header.count, {each.name: each for each in packed.header.properties}
@@ -547,7 +515,7 @@ def stored(source: OpenFile, options: WriteOptions) -> tuple[list[StoredChunk], 
 
 
 def _flat(codes: NDArray[Any], encoding: str, count: int) -> Bytes:
-    """Return the bytes of a property, a copy; those of differences as the codes themselves."""
+    """Return a copy of the bytes of a property, after summing up differences."""
     flat = np.array(codes).reshape(-1).view(np.uint8)
     return np.cumsum(flat.reshape(-1, count), axis=1, dtype=np.uint8).reshape(-1) if _differs(encoding) else flat
 
