@@ -81,7 +81,7 @@ def encode_quat(quat_xyzw: FloatArray) -> Bytes:
 
 
 def quat_components() -> FloatArray:
-    """Return the (256,) components of rotations by their bytes; error at most 1.1 degrees of rotation."""
+    """Return the (256,) components of rotations by their bytes. Largest error: 1.1 degrees of rotation."""
     return (np.arange(256, dtype=np.float32) / np.float32(127.5) - 1) * np.float32(np.sqrt(0.5))
 
 
