@@ -264,13 +264,3 @@ def test_a_property_in_another_encoding_is_encoded_anew() -> None:
     after = decode(rad, written(encoder, before))
     assert np.abs(after.splats.rgb - before.splats.rgb).max() > 0
     assert_same(after.splats, before.splats, but="rgb")
-
-
-def test_the_same_rows_are_found() -> None:
-    one = random_splats(6, sh_degree=1)
-    other = one.take(np.arange(6))
-    assert same_rows(one, other).all()
-    for row, name in enumerate(COLUMNS):
-        column = getattr(other, name)
-        column.reshape(len(other), -1)[row, -1] *= np.float32(-0.5)
-    assert not same_rows(one, other).any()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import json
 import os
 import struct
@@ -20,7 +19,6 @@ from sparklod_cli.codecs import gltf, gltf_container
 from sparklod_cli.codecs.formats import PROFILES, WriteOptions
 from sparklod_cli.codecs.gltf import READ_AS_LOGS
 from sparklod_cli.codecs.gltf_container import TURNS
-from sparklod_cli.codecs.reader import OpenFile
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io.files import companions
 from sparklod_cli.io.reading import open_reader, read_scene
@@ -181,13 +179,10 @@ def chain(length: int, **fields: Any) -> list[dict[str, Any]]:
         ([{"mesh": 0, "matrix": [1] * 15}], "expected a list of 16 numbers"),
         ([{"mesh": 0, "rotation": [0, 0, 0, 0]}], "no unit quaternion"),
         ([{"mesh": 0, "translation": [1e300, 0, 0]}], "expected a (list of 3 numbers|number up to)"),
-        ([{"mesh": 0, "translation": "far"}], "expected a (list of 3 numbers|number up to)"),
         (chain(40, scale=[1e12] * 3), "multiply to numbers beyond"),
-        (chain(40, translation=[1e12, 0, 0]), "multiply to numbers beyond"),
         (chain(40, scale=[1e-12] * 3), "is singular"),
         (chain(2, scale=[1e-10] * 3), r"the scale 1e-20 is out of range"),
         ([{"mesh": 0, "children": [1]}, {"children": [0]}], "linked in a circle"),
-        ([{"mesh": 0, "children": [0]}], "linked in a circle"),
         ("none", "nodes of its JSON is no array of objects"),
     ],
 )
@@ -210,9 +205,7 @@ def changed(what: str, index: int, **changes: Any) -> bytes:
     ("data", "text"),
     [
         (changed("accessors", 0, count=61), "accessor 0 has 61 values, more than its buffer view holds"),
-        (changed("accessors", 0, count=1 << 31), "more than its buffer view holds"),
         (changed("accessors", 0, count=-1), "count of accessors.0.: .* not -1"),
-        (changed("accessors", 0, count=1e3), "count of accessors.0.: .* not 1000.0"),
         (changed("accessors", 0, count=59), "different numbers of values"),
         (changed("accessors", 0, byteOffset=4), "more than its buffer view holds"),
         (changed("accessors", 0, bufferView=99), "there is no 99 among the 13 bufferViews"),
@@ -224,7 +217,6 @@ def changed(what: str, index: int, **changes: Any) -> bytes:
         (changed("bufferViews", 0, byteLength=1 << 31), "buffer view 0 ends beyond its buffer"),
         (changed("bufferViews", 0, byteOffset=-4), "byteOffset of bufferViews.0.: .* not -4"),
         (changed("bufferViews", 0, byteStride=4), "stride of accessor 0 is 4"),
-        (changed("bufferViews", 0, byteStride=1 << 30), "stride of accessor 0 is"),
         (changed("bufferViews", 0, buffer=1), "there is no 1 among the 1 buffers"),
         (changed("buffers", 0, byteLength=100), "ends beyond its buffer"),
         (changed("buffers", 0, uri="http://example.org/x.bin"), "not a file below its folder"),
@@ -245,13 +237,6 @@ def test_incomplete_sh_of_a_degree_are_refused(name: str) -> None:
     del meshes[0]["primitives"][0]["attributes"][f"{by_hand_glb.NAME}:{name}"]
     with pytest.raises(FormatError, match=r"SH of degree \d are incomplete"):
         read(with_root(GOLDEN, meshes=meshes))
-
-
-def test_numbers_that_are_not_finite_are_read_and_invalid() -> None:
-    columns = linear(Scene(SH2))
-    columns["scale"] = np.where(np.arange(40)[:, None] == 7, np.nan, columns["scale"])
-    back = read(by_hand_glb.glb(**columns)).splats
-    assert np.flatnonzero(~back.is_valid()).tolist() == [7]
 
 
 def test_other_color_spaces_and_kernels_are_noted() -> None:
@@ -615,12 +600,6 @@ def test_extreme_scales_are_read_without_a_warning(value: float) -> None:
         assert len(read(with_scales(splats, scales)).splats) == len(splats)
         scales[::2] = 1.0
         assert len(read(with_scales(splats, scales)).splats) == len(splats)
-
-
-def test_an_empty_primitive_is_opened() -> None:
-    data = by_hand_glb.split(A)[0]["accessors"]
-    content = gltf.open_content(OpenFile(io.BytesIO(with_root(A, accessors=[each | {"count": 0} for each in data]))))
-    assert content.count == 0 and content.notes == ()
 
 
 # --- Other programs ---------------------------------------------------------------------------------------------------

@@ -18,7 +18,6 @@ import pytest
 from numpy.typing import NDArray
 
 from fixtures import by_hand_rad
-from sparklod_cli import __version__
 from sparklod_cli.codecs.formats import DEFAULTS, RadOptions, WriteOptions
 from sparklod_cli.codecs.losses import clamps_in
 from sparklod_cli.codecs.rad import rad_writer as rad
@@ -259,18 +258,6 @@ def test_chunk_files_hold_the_bytes_of_one_file_for_any_number_of_threads(two_ch
     assert len(whole) == header.bytes + header.all_chunk_bytes
 
 
-def test_a_tree_of_two_chunks_round_trips(two_chunks: Scene) -> None:
-    data = written(two_chunks)
-    back, header = decode(rad, data), read_header(io.BytesIO(data))
-    assert back.tree is not None and two_chunks.tree is not None
-    np.testing.assert_array_equal(back.tree.child_start, two_chunks.tree.child_start)
-    np.testing.assert_array_equal(back.tree.child_count, two_chunks.tree.child_count)
-    assert back.chunk_bytes == tuple(entry.bytes for entry in header.chunks)
-    assert (header.chunk_size, header.lod_tree, header.max_sh) == (CHUNK_NODES, True, 1)
-    assert json.loads(str(header.comment)) == {"generator": f"sparklod {__version__}"}
-    assert header.encoding is not None and header.encoding.lod_opacity
-
-
 def test_an_opaque_leaf_does_not_become_a_merged_splat() -> None:
     splats = random_splats(200)
     splats.opacity[:] = np.linspace(0, 1, 200)
@@ -283,11 +270,6 @@ def test_an_opaque_leaf_does_not_become_a_merged_splat() -> None:
     assert decode(rad, written(tree, alpha="r8")).splats.opacity[1:].max() <= 1
 
 
-def test_an_empty_scene_is_a_file_without_chunks() -> None:
-    back = decode(rad, written(Scene(random_splats(0, sh_degree=2))))
-    assert (len(back), back.tree, back.splats.sh_degree, back.chunk_bytes) == (0, None, 2, ())
-
-
 # --- Palettes ---------------------------------------------------------------------------------------------------------
 
 
@@ -297,14 +279,6 @@ def few_sh() -> Scene:
     splats = random_splats(500, sh_degree=3)
     splats.sh[:] = splats.sh[np.random.default_rng(2).permutation(500) % 40]
     return Scene(splats, broad_tree(500))
-
-
-def test_a_large_palette_holds_all_sh_exactly(few_sh: Scene) -> None:
-    data, plain = written(few_sh, sh_codes=64, sh="f32"), written(few_sh, sh="f32")
-    back = decode(rad, data).splats
-    np.testing.assert_array_equal(back.sh, few_sh.splats.sh)
-    assert_same(back, decode(rad, plain).splats)
-    assert len(data) < 0.7 * len(plain)
 
 
 def test_a_palette_is_padded_to_the_splats_of_the_first_chunk(few_sh: Scene) -> None:
@@ -336,15 +310,6 @@ def test_a_small_palette_approximates_sh_with_any_threads_and_in_chunk_files(few
 
 def chosen(splats: Splats, **options: Any) -> RadOptions:
     return rad.settled(Scene(splats), WriteOptions(rad=RadOptions(**options))).rad
-
-
-def test_settled_options_are_complete_and_stable() -> None:
-    scene = Scene(random_splats(500, sh_degree=2))
-    once = rad.settled(scene, DEFAULTS)
-    assert "auto" not in dataclasses.asdict(once.rad).values()
-    assert once.rad.ranges is not None
-    assert rad.settled(scene, once) == once
-    assert written(scene) == encode(rad, scene, once)
 
 
 def test_centers_are_rounded_to_a_fraction_of_a_small_splat_unless_their_encoding_is_given() -> None:
@@ -587,14 +552,6 @@ def test_a_label_beyond_the_palette_is_named() -> None:
     header["chunks"][1]["bytes"] = len(data)
     result = attempt_chunked(CHUNK_FILES | {"sh3-1.radc": data, "sh3.rad": by_hand_rad.headed(b"RAD0", header)})
     assert result == "SH label 24 of chunk 1 is beyond the 24 codes of the palette"
-
-
-def test_a_range_beyond_float32_is_refused() -> None:
-    fields = json.loads(PARTS["0.json"])
-    ranged = next(number for number, each in enumerate(fields["properties"]) if CODINGS[each["encoding"]].ends)
-    text = json.dumps(replaced(fields, ("properties", ranged, "max"), 1e39)).encode()
-    with pytest.raises(FormatError, match=r"its max is 1e\+39$"):
-        decode(rad, by_hand_rad.joined(PARTS | {"0.json": text}, PARTS))
 
 
 # --- Files of Spark's own tool ----------------------------------------------------------------------------------------

@@ -144,13 +144,6 @@ def test_a_codebook_may_begin_with_null() -> None:
     np.testing.assert_allclose(np.log(splats.scale[0, :2]), [1 - 1 / 255, 1], atol=1e-6)
 
 
-def test_a_comment_of_the_zip_makes_no_difference() -> None:
-    file = io.BytesIO(by_hand_sog.zipped(FILES))
-    with zipfile.ZipFile(file, "a") as archive:
-        archive.comment = b"made by hand"
-    assert_same(cases.decode(sog, file.getvalue()).splats, read_scene(FOLDER).splats)
-
-
 def test_a_meta_may_have_another_name_and_space_before_it(tmp_path: Path) -> None:
     for name, data in FILES.items():
         (tmp_path / name.replace("meta.json", "scene.txt")).write_bytes(b"\r\n\t " * (name == "meta.json") + data)
@@ -171,6 +164,7 @@ def test_images_may_be_larger_than_they_need_be() -> None:
 OUTSIDE = (
     *("../secret.webp", "..", ".", "", "/etc/hostname", "sub/secret.webp", "./means_l.webp", "sub\\secret.webp"),
     *("C:\\secret.webp", "C:secret.webp", "\\\\host\\share", "a\0b", "file:///etc/hostname", "~", "missing.webp"),
+    *("\ud800.webp", "\udcff.webp", "\x1b[2J\n.webp", "x" * 3000),
 )
 
 
@@ -195,8 +189,7 @@ def test_a_name_that_leads_elsewhere_is_refused(name: str, zipped: bool, tmp_pat
     with pytest.raises(FormatError) as caught:
         read_scene(path)
     assert "names" in str(caught.value) or "is a directory" in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert "\0" not in str(caught.value)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 300
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links are for POSIX")
@@ -246,15 +239,11 @@ EDITS: dict[str, tuple[tuple[str, ...], Any, str]] = {
     "version 3": (("version",), 3, "SOG version 3 is unknown"),
     "no splats": (("count",), 0, "0 splats"),
     "more splats than pixels": (("count",), 65, "64 texels for 65 splats"),
-    "a count of a half": (("count",), 59.5, "count of meta.json: expected a whole number"),
     "no count": (("count",), ..., "count of meta.json: expected .* but it is missing"),
     "no means": (("means",), ..., "means of meta.json: expected an object, but it is missing"),
     "two axes": (("means", "mins"), [0, 0], "means.mins of meta.json: expected a list of 3"),
-    "bounds of no number": (("means", "maxs"), [0, "1", 2], "maxs.1. of meta.json: expected"),
     "infinite bounds": (("means", "maxs"), [0, 1, float("inf")], "expected a number .* not inf"),
     "a short codebook": (("scales", "codebook"), [0] * 255, "expected a list of 256 numbers"),
-    "a null": (("scales", "codebook"), [0, None] + [0] * 254, "codebook.1. of meta.json: expected a number"),
-    "a name of no text": (("quats", "files"), [7], "quats.files.0. of meta.json: expected a text, not 7"),
     "no second file": (("means", "files"), ["means_l.webp"], "means.files.1. of .* it is missing"),
     "other bands": (("shN", "bands"), 2, "has 3 coefficients, not those of 2 bands"),
 }
@@ -268,9 +257,7 @@ REFUSED = {name: (with_meta(replaced(META, way, value)), reason) for name, (way,
     "a small image of labels": (FILES | {"shN_labels.webp": SMALL}, "has 16 texels for 60 splats"),
     "centroids of another width": (FILES | {"shN_centroids.webp": FILES["sh0.webp"]}, "shN_centroids|centroids"),
     "no JSON": (FILES | {"meta.json": b"{'version': 2}"}, "meta.json is not JSON"),
-    "a list": (FILES | {"meta.json": b"[2]"}, "meta.json is not that of a SOG"),
     "another object": (FILES | {"meta.json": b'{"version": 2}'}, "meta.json is not that of a SOG"),
-    "bytes that are no text": (FILES | {"meta.json": b'{"version": "\xff"}'}, "meta.json is not JSON"),
 }
 
 
@@ -287,23 +274,6 @@ def test_a_folder_without_its_files_is_refused(tmp_path: Path) -> None:
     (tmp_path / "meta.json").write_bytes(FILES["meta.json"])
     with pytest.raises(FormatError, match=r"means_l\.webp.*no such file"):
         read_scene(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "name", ["\ud800.webp", "\udcff.webp", "\0.webp", "\x1b[2J\n.webp", "x" * 3000, "../a.webp", "", "."]
-)
-def test_a_missing_image_is_named_in_one_line(name: str, tmp_path: Path) -> None:
-    meta = json.loads(FILES["meta.json"])
-    meta["quats"]["files"] = [name]
-    for file, data in (FILES | {"meta.json": json.dumps(meta).encode()}).items():
-        (tmp_path / file).write_bytes(data)
-    for source in (tmp_path, tmp_path / "zipped.sog"):
-        if source != tmp_path:
-            source.write_bytes(by_hand_sog.zipped(FILES | {"meta.json": json.dumps(meta).encode()}))
-        with pytest.raises(FormatError, match=r"names|which it names") as caught:
-            read_scene(source)
-        assert str(caught.value).isprintable()
-        assert len(str(caught.value)) < 250
 
 
 # --- Written ----------------------------------------------------------------------------------------------------------
@@ -394,16 +364,6 @@ def test_writing_a_decoded_scene_again_changes_next_to_nothing(name: str) -> Non
             assert off.max() < 1e-4
         else:
             np.testing.assert_allclose(two, one, rtol=3e-6, atol=3e-6, err_msg=column)
-
-
-def test_scales_of_0_and_the_largest_stay() -> None:
-    splats = random_splats(2000)
-    splats.scale[7], splats.scale[8] = [0, 0.01, 0], 1e-20
-    splats.scale[9] = 5e4
-    found = back(Scene(splats)).scale
-    np.testing.assert_array_equal(found[7] == 0, [True, False, True])
-    np.testing.assert_allclose(found[9], 5e4, rtol=1e-5)
-    assert ((found == 0) == (splats.scale == 0)).all()
 
 
 def test_scales_of_any_range_grow_by_a_third_at_most() -> None:
@@ -502,12 +462,6 @@ def test_more_splats_than_an_image_has_texels_are_refused(monkeypatch: pytest.Mo
     sog.settled(Scene(random_splats(16)), WriteOptions())
     with pytest.raises(FormatError, match="17 splats; a SOG holds at most 16"):
         sog.settled(Scene(random_splats(17)), WriteOptions())
-
-
-@pytest.mark.parametrize("codes", [0, 65_537])
-def test_palettes_of_no_code_or_too_many_are_refused(codes: int) -> None:
-    with pytest.raises(ValueError, match=f"sh_codes is {codes}"):
-        sog.settled(Scene(random_splats(2)), WriteOptions(sog=SogOptions(sh_codes=codes)))
 
 
 # --- Lossy images: a finding, and a line when baking ------------------------------------------------------------------

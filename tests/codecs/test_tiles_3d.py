@@ -215,11 +215,9 @@ LARGE = [1e12, 0, 0, 0, 0, 1e12, 0, 0, 0, 0, 1e12, 0, 0, 0, 0, 1]
         (child(content={"uri": "a.glb?v=1"}), "is not a file below its folder"),
         (child(content={"uri": "none.glb"}), "there is no 'none.glb'"),
         (child(content={}), r"root\.children\[0\]\.content\.uri of tileset\.json: expected a text, but it is missing"),
-        (child(content=3), r"root\.children\[0\]\.content of tileset\.json: expected an object, not 3"),
         (child(children={}), "expected a list, not {}"),
         (child(content={"uri": "tiles/0-0.glb"}, children=[{"content": {"uri": "tiles/0-0.glb"}}] * 2), "two tiles"),
         (child(transform=LARGE, children=[{"transform": LARGE}]), "multiply to numbers"),
-        (child(transform=FAR), "multiply to numbers beyond"),
         (child(transform=[0] * 15 + [1]), "is singular"),
         (changed(lambda each: each["root"].update(transform=FAR)), "root: transforms multiply to numbers beyond"),
         (child(transform=[1] * 16), "transform of .* is .*, not 16 finite numbers"),
@@ -232,7 +230,6 @@ LARGE = [1e12, 0, 0, 0, 0, 1e12, 0, 0, 0, 0, 1e12, 0, 0, 0, 0, 1]
         ),
         (changed(lambda each: each.update(extensionsRequired=["X_y"])), "requires the extension 'X_y'"),
         (changed(lambda each: each.pop("root")), "root of tileset.json: expected an object, but it is missing"),
-        (changed(lambda each: each.pop("asset")), "asset of tileset.json: expected an object, but it is missing"),
         (changed(lambda each: (each["root"].pop("content"), each["root"].pop("children"))), "no tile of it has splats"),
     ],
 )
@@ -258,7 +255,6 @@ def test_nested_tilesets_in_a_circle_are_refused() -> None:
         ({"box": [None] * 12}, "something else than finite numbers"),
         ({"sphere": [0, 0, 0, -1]}, "a radius below 0"),
         ({}, "none of box, sphere and region"),
-        (None, "none of box, sphere and region"),
     ],
 )
 def test_a_wrong_bounding_volume_is_refused_by_readers_of_tiles(volume: Any, match: str) -> None:
