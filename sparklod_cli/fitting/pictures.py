@@ -412,14 +412,7 @@ class Optimiser:
     def __init__(self, nodes: FittedNodes) -> None:
         self.nodes = nodes
         self._moved: list[Any] = []
-        count, terms = len(nodes.fitted), nodes.columns.sh.shape[1]
-        self._slots = slots_of(nodes)
-        self._moments = adam.Moments(
-            np.zeros((count, adam.FIRST), np.float32),
-            np.zeros((count, terms, 3), np.float32),
-            np.zeros((count, adam.SECOND), np.float32),
-            np.zeros(count, np.int32),
-        )
+        self._slots, self._moments = initial_state(nodes)
 
     def step(self, picture: FullDetailPicture, index: Index, rates: adam.Rates) -> None:
         """Move the nodes of a cut towards a picture of full detail."""
@@ -445,8 +438,10 @@ class Optimiser:
         """Update the columns of the nodes; here they are always current."""
 
 
-def slots_of(nodes: FittedNodes) -> NDArray[np.int32]:
-    """Return the (N,) row of each node in `Moments`, -1 for nodes that do not change."""
-    slots = np.full(len(nodes.tree), -1, np.int32)
-    slots[nodes.fitted] = np.arange(len(nodes.fitted), dtype=np.int32)
-    return slots
+def initial_state(nodes: FittedNodes) -> tuple[NDArray[np.int32], adam.Moments]:
+    """Return the (N,) row of each node in `Moments`, -1 for nodes that do not change, and moments of 0."""
+    slots, count = np.full(len(nodes.tree), -1, np.int32), len(nodes.fitted)
+    slots[nodes.fitted] = np.arange(count, dtype=np.int32)
+    shapes = (count, adam.FIRST), (count, *nodes.columns.sh.shape[1:]), (count, adam.SECOND)
+    first, first_sh, second = (np.zeros(shape, np.float32) for shape in shapes)
+    return slots, adam.Moments(first, first_sh, second, np.zeros(count, np.int32))

@@ -178,11 +178,14 @@ def losses(nodes: Splats, tree: LodTree, parent: NDArray[np.int32]) -> Column:
     loss = np.sqrt(picture_errors(with_plain_opacity(nodes), parent)) * size
     logs = np.log(np.maximum(size[tree.is_leaf], np.finfo(np.float64).tiny))
     power = min(1.0, float(logs.std()) / SIZES_DIFFER)
-    leaves = tree.is_leaf.astype(np.float64)
-    for family, members, starts in _families(tree):
-        leaves[family] = np.add.reduceat(leaves[members], starts)
-        own = np.nan_to_num(loss[family], nan=0.0) * leaves[family] ** power
-        loss[family] = np.maximum(own, np.maximum.reduceat(loss[members], starts))
+    leaves, largest = tree.is_leaf.astype(np.float64), np.zeros(len(tree))  # largest: of the losses of children
+    depth = tree.depths()
+    for level in np.split(np.argsort(depth, kind="stable"), np.cumsum(np.bincount(depth))[:-1])[::-1]:
+        inner = level[~tree.is_leaf[level]]
+        own = np.nan_to_num(loss[inner], nan=0.0) * leaves[inner] ** power
+        loss[inner] = np.maximum(own, largest[inner])
+        np.add.at(leaves, parent[level], leaves[level])
+        np.maximum.at(largest, parent[level], loss[level])
     return loss
 
 
@@ -230,21 +233,6 @@ def _shared(splats: Splats, shape: Column, first: NDArray[np.int64], second: NDA
             power = (yy * x * x - 2 * xy * x * y + xx * y * y) / det
             total += np.where(det > 0, np.sqrt(own / det) * np.exp(-power / 2), 0.0)
         found[begin : begin + BLOCK] = high * total * (2 / 3)
-    return found
-
-
-def _families(tree: LodTree) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]]:
-    """Return, for each depth from the deepest: its inner nodes, all their children, and where those of each begin."""
-    depth = tree.depths()
-    inner = np.flatnonzero(~tree.is_leaf)
-    inner = inner[np.argsort(depth[inner], kind="stable")]
-    found = []
-    for family in np.split(inner, np.flatnonzero(np.diff(depth[inner])) + 1)[::-1]:
-        count = tree.child_count[family].astype(np.int64)
-        starts = np.cumsum(count) - count
-        first = tree.child_start[family].astype(np.int64)
-        if len(family):
-            found.append((family, np.repeat(first - starts, count) + np.arange(count.sum()), starts))
     return found
 
 

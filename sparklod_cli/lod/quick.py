@@ -244,8 +244,8 @@ class VoxelTree:
         size = 2 * len(index)
         self.rows = NodeRows(np.empty((size, WIDTH), np.float32), np.empty(size, np.uint32), np.empty(size, np.uint16))
         self._used, self._awaited, self._total = 0, len(index), 0
-        self._center, self._scale = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
-        self._quat, self._opacity = np.empty((size, 4), np.float32), np.empty(size, np.float32)
+        shapes = (size, 3), (size, 3), (size, 4), (size,)  # centre, scale, rotation, opacity
+        self._geometry = tuple(np.empty(shape, np.float32) for shape in shapes)
         self._weight, self._number = np.empty(size, np.float64), np.empty(size, np.uint32)
         self._count = np.empty(size, np.uint16)
 
@@ -370,7 +370,7 @@ class VoxelTree:
         self._number[part], self._count[part] = rows.number[nodes], rows.children[nodes]
         is_merged = (self._count[part] > 0) | (self._number[part] >= self._leaves)
         at = np.where(is_merged, np.arange(1, count + 1, dtype=np.uint32), np.uint32(0))
-        columns = self._center[part], self._scale[part], self._quat[part], self._opacity[part]
+        columns = (column[part] for column in self._geometry)
         fill_merged_splats(count, at, 1, nodes, rows.node, self._grid.space, *columns)
         self._total += count
 
@@ -400,9 +400,10 @@ class VoxelTree:
         owner[start[inner]] = inner + np.uint32(1)
         parents = owner[owner > 0] - np.uint32(1)
         del owner, inner
-        geometry = self._center[part], self._scale[part], self._quat[part], self._opacity[part]
         sh = given.sh.shape[1:]
-        out = Splats(*geometry, np.empty((total, 3), np.float32), np.empty((total, *sh), np.float32))
+        center, scale, quat, opacity = (column[part] for column in self._geometry)
+        rgb, coefficients = np.empty((total, 3), np.float32), np.empty((total, *sh), np.float32)
+        out = Splats(center, scale, quat, opacity, rgb, coefficients)
         for name in COLUMNS:
             column, filled = getattr(given, name), getattr(out, name)
             width = math.prod(filled.shape[1:])

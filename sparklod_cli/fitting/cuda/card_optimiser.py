@@ -10,7 +10,7 @@ from ...render.cuda.card import CardArray, card_errors, on_card, to_card
 from ...render.cuda.card_gradients import gradients_on_card
 from ...render.cuda.card_rasterizer import CardPicture, CardSplats, CardView, draw_on_card
 from ..kernels import adam
-from ..pictures import LEAST_ERROR, FittedNodes, FullDetailPicture, Index, Optimiser, slots_of
+from ..pictures import LEAST_ERROR, FittedNodes, FullDetailPicture, Index, Optimiser, initial_state
 from . import kernels
 
 
@@ -23,13 +23,11 @@ class CardOptimiser(Optimiser):
     def __init__(self, nodes: FittedNodes) -> None:
         self.nodes, self._moved = nodes, []
         self._errors = functools.partial(card_errors, len(nodes.leaves))
-        count, terms = len(nodes.fitted), nodes.columns.sh.shape[1]
+        slots, moments = initial_state(nodes)
         with self._errors():
             self._now = CardSplats.of(*nodes.columns)
             self._old = tuple(map(to_card, nodes.old))
-            self._slots = to_card(slots_of(nodes))
-            shapes = (count, adam.FIRST), (count, terms, 3), (count, adam.SECOND)
-            moments = (*(np.zeros(shape, np.float32) for shape in shapes), np.zeros(count, np.int32))
+            self._slots = to_card(slots)
             self._moments = adam.Moments(*map(to_card, moments))
             self._rates = on_card(len(adam.Rates._fields))
         # Cameras and pictures on the card, by the identity of pictures, which live as long as the fit.
