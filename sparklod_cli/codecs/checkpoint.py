@@ -1,6 +1,6 @@
 """Checkpoints of gsplat and nerfstudio (.pt, .ckpt): zips of PyTorch, read without PyTorch.
 
-A zip has `NAME/data.pkl`, a pickle that describes tensors, and `NAME/data/KEY`, their numbers. Facts: `torch.save`,
+A zip has `NAME/data.pkl`, a pickle that describes tensors, and `NAME/data/KEY`, their numbers. Sources: `torch.save`,
 `examples/simple_trainer.py` of gsplat, `splatfacto.py` of nerfstudio.
 """
 
@@ -30,29 +30,27 @@ from .formats import ZIP
 from .merging import ZIP_ERRORS
 from .reader import HARMLESS, OpenFile, Reader, RowBuffer, left_out
 
-#: Bytes of data.pkl at most. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
+#: Largest data.pkl, bytes. That of nerfstudio, with the state of its optimisers, has some 50,000. Chosen.
 MOST_PICKLE = 1 << 24
 
-#: Numbers from one row of a tensor to the next at most: those of all SH coefficients of degree 4, of which `sh0` may be
-#: a part. What is between is read, too.
+#: Most numbers from one row of a tensor to the next: all SH coefficients of degree 4, of which `sh0` may be a part. The
+#: numbers in between are read, too.
 MOST_PITCH = 75
 
-#: Bytes of a member's local header before its name, and of its fields with the lengths of the name and of what follows.
+#: Bytes of a local header of a zip member before the name, and of the lengths of the name and of the extra field.
 LOCAL_HEADER, LENGTHS = 30, slice(26, 30)
 
-#: Where nerfstudio has the tensors in "pipeline", the newest first.
+#: Prefixes of the tensors of splats in nerfstudio's "pipeline", the newest first.
 PREFIXES = ("_model.gauss_params.", "_model.")
 
 #: Entries of a checkpoint, and parts of names of tensors, that belong to the training and not to the scene.
 TRAINING = {"optimizer", "optimizers", "scheduler", "schedulers", "scaler", "scalers", "strategy_state"}
 TRAINING |= {"psnr", "ssim", "lpips", "device_indicator", "device_indicator_param"}
 
-
 Decode = Callable[[FloatArray], FloatArray]
 
-#: The tensors of every checkpoint: the names in gsplat and in nerfstudio, the column of `Splats`, the numbers of a
-#: splat (None for three for each coefficient of SH), and the decoder. Scales are logarithms, opacities logits,
-#: rotations of any length.
+#: The tensors of splats: names in gsplat and in nerfstudio, column of `Splats`, numbers per splat (None: three per SH
+#: coefficient), and decoder. Scales are logarithms, opacities logits, rotations of any length.
 COLUMNS: tuple[tuple[tuple[str, str], str, int | None, Decode], ...] = (
     (("means", "means"), "center", 3, np.asarray),
     (("scales", "scales"), "scale", 3, quantize.decode_log),
@@ -65,7 +63,7 @@ COLUMNS: tuple[tuple[tuple[str, str], str, int | None, Decode], ...] = (
 
 @dataclass(frozen=True)
 class _StoredColumn:
-    """Values of a tensor for a column of `Splats`: `type` of a splat, every `pitch` bytes from `offset` on."""
+    """Tensor of a column of `Splats`: values of `type` for each splat, every `pitch` bytes from `offset` on."""
 
     tensor: str
     column: str
@@ -75,7 +73,7 @@ class _StoredColumn:
     pitch: int
 
     def read(self, source: OpenFile, start: int, stop: int) -> FloatArray:
-        """Return the values of some splats, as float32."""
+        """Read the values of a range of splats as float32."""
         if not self.type.itemsize or start == stop:
             return np.empty((stop - start, self.type.shape[0]), np.float32)
         size = (stop - start - 1) * self.pitch + self.type.itemsize
@@ -115,7 +113,7 @@ def open_content(source: OpenFile) -> Reader:
     notes = notes_on_degree(degree) + left_out("tensor", "tensors", _others(root, {*known, *HARMLESS}))
 
     def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
-        @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
+        @np.errstate(over="ignore", invalid="ignore")  # invalid numbers are reported later
         def read(part: slice) -> slice:
             for each in stored:
                 out = getattr(target.splats, each.column)[part]
@@ -130,25 +128,23 @@ def open_content(source: OpenFile) -> Reader:
 
 
 def _tensors_of(root: Any) -> tuple[Mapping[str, Tensor], int]:
-    """Return the tensors of the splats by their names, and the number of the program in `COLUMNS`."""
-    splats, pipeline = (root.get(key) if isinstance(root, dict) else None for key in ("splats", "pipeline"))
-    if isinstance(splats, dict):
-        return {name: each for name, each in splats.items() if isinstance(each, Tensor)}, 0
-    entries = pipeline if isinstance(pipeline, dict) else {}
-    for prefix in PREFIXES:
-        found = {
-            name.removeprefix(prefix): each
-            for name, each in entries.items()
-            if isinstance(each, Tensor) and name.startswith(prefix)
-        }
-        if "means" in found:
-            return found, 1
+    """Return the tensors of the splats by name, and the index of the names of their program in `COLUMNS`."""
+    entries = {key: root[key] for key in ("splats", "pipeline") if isinstance(root, dict) and key in root}
+    for key, prefix, program in (("splats", "", 0), *(("pipeline", prefix, 1) for prefix in PREFIXES)):
+        if isinstance(entries.get(key), dict):
+            tensors = {
+                name.removeprefix(prefix): each
+                for name, each in entries[key].items()
+                if isinstance(each, Tensor) and name.startswith(prefix)
+            }
+            if key == "splats" or "means" in tensors:
+                return tensors, program
     raise NotSplatsError("a checkpoint of PyTorch without splats of gsplat (splats) or nerfstudio (pipeline)")
 
 
 def _others(root: Mapping[str, Any], known: Collection[str]) -> Iterator[str]:
-    """Yield names for the tensors of a scene whose names are not known, one for all of a module."""
-    walked = set[int]()  # a pickle may have a dict in many places
+    """Yield the names of other tensors of the scene, or of the modules that they belong to."""
+    walked = set[int]()  # a pickle may have one dict in many places
     for key, value in root.items():
         entries = value if isinstance(value, dict) else {key: value}
         if id(entries) in walked:
@@ -163,6 +159,8 @@ def _others(root: Mapping[str, Any], known: Collection[str]) -> Iterator[str]:
 
 
 class _TensorArchive:
+    """Zip of PyTorch with one checkpoint."""
+
     def __init__(self, source: OpenFile) -> None:
         self._file, self._size = source.file, source.size
         try:
@@ -188,7 +186,8 @@ class _TensorArchive:
         return member
 
     def _offset(self, member: zipfile.ZipInfo) -> int:
-        self._file.seek(max(member.header_offset, 0))  # a damaged directory gives negative ones
+        """Return the position of the first byte of a member's data."""
+        self._file.seek(max(member.header_offset, 0))  # negative in a damaged directory
         header = self._file.read(LOCAL_HEADER)
         if len(header) < LOCAL_HEADER or not header.startswith(ZIP):
             raise TruncatedError("cut short, or corrupt: a member of its zip does not begin where it should")
@@ -204,13 +203,13 @@ class _TensorArchive:
             raise FormatError(f"{quoted_value(name)} cannot be read: {quoted(error)}") from None
 
     def root(self) -> Any:
-        """Return the object of the pickle, of dicts, lists, plain values and tensors."""
+        """Read the object of the pickle, which consists of dicts, lists, plain values and tensors."""
         if self._folder + "byteorder" in self._names and self._read("byteorder", 16) != b"little":
             raise FormatError("its numbers are big-endian, which is not read")
         return unpickled(self._read("data.pkl", MOST_PICKLE))
 
     def place_of(self, name: str, tensor: Tensor) -> tuple[int, int]:
-        """Return where the values of a tensor begin in the file, and the bytes from one row to the next."""
+        """Return the position of a tensor's first value in the file, and the bytes from one row to the next."""
         if tensor.type is None:
             raise FormatError(f"its tensor {name} has no numbers of 16, 32 or 64 bits with a point")
         member, values = self._member(f"data/{tensor.key}"), math.prod(tensor.size)
@@ -224,16 +223,16 @@ class _TensorArchive:
         return offset + tensor.first * tensor.type.itemsize, pitch * tensor.type.itemsize
 
 
-#: Steps of a pickle at most. That of nerfstudio, with the states of optimisers and metrics, takes some 15,000. Chosen.
+#: Most steps of a pickle. That of nerfstudio, with the states of optimisers and metrics, takes some 15,000. Chosen.
 MOST_STEPS = 1 << 18
 
-#: Axes of a tensor at most; those of splats have three. Chosen.
+#: Most axes of a tensor; those of splats have three. Chosen.
 MOST_AXES = 8
 
-#: Bits of a number that means something: sizes, strides and offsets of PyTorch have 64.
+#: Most bits of a number: sizes, strides and offsets of PyTorch have 64.
 MOST_BITS = 64
 
-#: Types of numbers by PyTorch's names of storages.
+#: Types of numbers, by PyTorch's names of storages.
 STORAGES: dict[str, np.dtype[Any]] = {
     "torch FloatStorage": np.dtype("<f4"),
     "torch DoubleStorage": np.dtype("<f8"),
@@ -259,10 +258,10 @@ class Tensor:
     """Description of a tensor.
 
     Attributes:
-        type: of its numbers; None if it is not in `STORAGES`.
-        key: of its storage.
-        first: index of its first number in the storage.
-        size, stride: of each axis, in numbers.
+        type: type of the numbers; None if it is not in `STORAGES`.
+        key: name of the storage.
+        first: index of the first number in the storage.
+        size, stride: length of each axis, and numbers from one index to the next.
     """
 
     type: np.dtype[Any] | None
@@ -273,9 +272,9 @@ class Tensor:
 
     @property
     def pitch(self) -> int | None:
-        """Numbers from one row, of the first axis, to the next; None if the numbers of a row have gaps or turns.
+        """Numbers from one row, an index of the first axis, to the next; None if the numbers of a row are not in order.
 
-        The rows of a part of a larger tensor are apart, as those of SH that gsplat cuts off from all coefficients.
+        Rows of a slice of a larger tensor have gaps between them, such as gsplat's SH without the first coefficient.
         """
         row = 1
         for size, stride in zip(reversed(self.size[1:]), reversed(self.stride[1:]), strict=True):
@@ -289,46 +288,46 @@ class Tensor:
 
 @dataclass(frozen=True)
 class _Global:
-    """A function or class that the pickle names: module and name."""
+    """A function or class that the pickle names: its module, a space and its name."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class _Storage:
-    """Numbers that a persistent identifier names; fields as in `Tensor`."""
+    """Storage that a persistent identifier names; fields as in `Tensor`."""
 
     type: np.dtype[Any] | None
     key: str
 
 
 def unpickled(data: bytes) -> Any:
-    """Return the object of a pickle: dicts, lists, tuples, plain values, tensors; other objects become None.
+    """Decode a pickle to dicts, lists, tuples, plain values and tensors; other objects become None.
 
-    Entries of dicts whose keys are no texts are left out. Lists and tuples may contain themselves, and each other many
+    Entries of dicts whose keys are not str are dropped. Lists and tuples may contain themselves, and each other many
     times: do not walk through them.
     """
     machine = _Machine()
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about strange escapes in texts
+            warnings.simplefilter("ignore")  # about invalid escapes in texts
             for step, (opcode, argument, _) in enumerate(pickletools.genops(data)):
                 if opcode.name == "STOP":
                     return machine.stack.pop()
                 if step == MOST_STEPS:
                     raise FormatError(f"its pickle takes more than {MOST_STEPS:,} steps, which PyTorch does not write")
                 machine.run(opcode.name, argument)
-    except (IndexError, KeyError, ValueError) as error:  # of an empty stack, of an empty place, and of `pickletools`
+    except (IndexError, KeyError, ValueError) as error:  # an empty stack, an empty place, errors of `pickletools`
         raise FormatError("corrupt: its pickle cannot be read") from error
     raise FormatError("corrupt: its pickle has no end")
 
 
 class _Machine:
-    """Stack machine of pickles (PEP 307) that builds data only: nothing that a pickle names is imported or called.
+    """Stack machine of pickles (PEP 307) that only builds data: it imports and calls nothing that a pickle names.
 
-    The effort is bounded: the number of steps, each of which takes time in proportion to the bytes of its argument and
-    the values that it takes from the stack, the axes of a tensor, and the size of a number. Texts and names are taken
-    from the pickle, never made from other objects.
+    The effort is bounded: there are limits for the number of steps, the axes of a tensor and the size of a number, and
+    a step takes time in proportion to the bytes of its argument and the values that it takes from the stack. Texts and
+    names come from the pickle, never from other objects.
     """
 
     def __init__(self) -> None:
@@ -337,7 +336,7 @@ class _Machine:
         self._memo: dict[int, Any] = {}
 
     def run(self, opcode: str, argument: Any) -> None:
-        """Carry out one opcode."""
+        """Execute one opcode."""
         stack = self.stack
         if opcode in VALUES:
             is_long = type(argument) is int and argument.bit_length() > MOST_BITS
@@ -368,11 +367,8 @@ class _Machine:
             stack.append(_storage(stack.pop()))
         elif opcode in ("REDUCE", "NEWOBJ"):
             stack.append(_called(*self._popped(2)))
-        elif opcode in ("SETITEM", "APPEND"):
-            values = self._popped(2 if opcode == "SETITEM" else 1)
-            _extend(stack[-1], values)
-        elif opcode in ("SETITEMS", "APPENDS", "ADDITEMS"):
-            values = self._since_mark()
+        elif opcode in ("SETITEM", "APPEND", "SETITEMS", "APPENDS", "ADDITEMS"):
+            values = self._since_mark() if opcode.endswith("S") else self._popped(2 if opcode == "SETITEM" else 1)
             _extend(stack[-1], values)
         elif opcode == "BUILD":
             stack.pop()  # the state of an object
@@ -394,12 +390,12 @@ class _Machine:
 
 
 def _extend(container: Any, values: list[Any]) -> None:
-    """Add values to a list, or keys and values in turn to a dict."""
+    """Append values to a list, or add alternate keys and values to a dict."""
     if isinstance(container, list):
         container.extend(values)
     elif isinstance(container, dict):
         pairs = zip(values[::2], values[1::2], strict=True)
-        # Texts alone: their hashes are seeded, but those of integers can be made to collide.
+        # Only str, whose hashes are seeded: those of integers can be made to collide.
         container.update((key, value) for key, value in pairs if isinstance(key, str))
 
 
@@ -414,7 +410,7 @@ def _storage(pid: Any) -> _Storage | None:
 
 
 def _called(function: Any, arguments: Any) -> Any:
-    """Return the tensor or dict that a call in the pickle makes; None for other results."""
+    """Return the tensor or dict that a call in the pickle creates; None for other calls."""
     name = function.name if isinstance(function, _Global) else ""
     if name == "collections OrderedDict":
         return {}
@@ -426,7 +422,7 @@ def _called(function: Any, arguments: Any) -> Any:
 
 
 def _tensor(storage: Any, first: Any, size: Any, stride: Any) -> Tensor | None:
-    """Return a tensor by the arguments of its function; None if it has more than `MOST_AXES` axes."""
+    """Return the tensor that `_rebuild_tensor_v2` creates; None if it has more than `MOST_AXES` axes."""
     if not (isinstance(storage, _Storage) and isinstance(size, tuple) and isinstance(stride, tuple)):
         raise ValueError("no storage, size or stride")
     if len(size) > MOST_AXES:

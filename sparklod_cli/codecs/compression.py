@@ -1,13 +1,14 @@
-"""gzip and zstd: one gzip member written on several threads, and both read without buffering more than a piece.
+"""Compression by gzip and zstd: a writer of a gzip member on several threads, and readers of both piece by piece.
 
-zlib-ng deflates; benchmarks/notes/file-sizes.md explains why its own threaded gzip is not used. ISA-L inflates where
-the package isal is installed, zlib-ng elsewhere, with the same result; docs/decisions/05-spz.md has their speeds.
+zlib-ng deflates; benchmarks/notes/file-sizes.md explains why its own threaded gzip is not used. ISA-L inflates if the
+package isal is installed, else zlib-ng, with the same result; docs/decisions/05-spz.md has their speeds.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Iterator, Sequence
+from types import SimpleNamespace
 from typing import Any, BinaryIO
 
 from zlib_ng import zlib_ng
@@ -18,32 +19,31 @@ from ..system.threads import ordered_map
 from .formats import DEFAULT_COMPRESSION
 
 GZIP_MAGIC = b"\x1f\x8b"
-#: How a member of deflate begins that has no fields but the ten bytes of its head, and one with a comment behind these,
-#: which ends with a zero byte (RFC 1952).
+#: First bytes of a deflated member whose header consists of ten bytes, and of one with a comment behind these, which
+#: ends with a zero byte (RFC 1952).
 PLAIN_HEAD, COMMENTED_HEAD = GZIP_MAGIC + b"\x08\0", GZIP_MAGIC + b"\x08\x10"
 
-#: Bytes of a block that one thread deflates by itself. That blocks of this size refer to none before them costs 0.05 to
-#: 0.2 % of a file (docs/decisions/05-spz.md).
+#: Bytes of a block, which one thread deflates without references to the blocks before: this makes files 0.05 to 0.2 %
+#: larger (docs/decisions/05-spz.md).
 BLOCK = 1 << 19
 
 #: Bytes at the beginning of a block on which the ways to deflate it are compared.
 TRIED = 1 << 16
 
-
-#: How a block is deflated: the level, None for the one that was chosen, and the strategy of zlib.
+#: How a block is deflated: the level, None for that of the user, and the strategy of zlib.
 Way = tuple[int | None, int]
 
-#: Ways by kind of data; the one that makes the beginning of a block smallest is taken, the first of those that are
-#: equal. Most bytes of splats are noise, of which codes of Huffman make as little as a search does, in a third of the
-#: time; colours repeat in three bytes, which only level 9 looks for.
+#: Ways to deflate, by kind of data. Each block is deflated in the first of those ways that make its beginning smallest.
+#: Most bytes of splats are noise, which Huffman codes alone make as small as a search, in a third of the time. Colours
+#: repeat in three bytes, and only level 9 searches for such short strings.
 MIXED: tuple[Way, ...] = ((None, zlib_ng.Z_DEFAULT_STRATEGY),)
 NOISE: tuple[Way, ...] = ((None, zlib_ng.Z_HUFFMAN_ONLY), *MIXED)
 TRIPLES: tuple[Way, ...] = ((9, zlib_ng.Z_DEFAULT_STRATEGY), *MIXED)
 RUNS: tuple[Way, ...] = ((None, zlib_ng.Z_RLE), *MIXED)
 LINKS: tuple[Way, ...] = ((6, zlib_ng.Z_DEFAULT_STRATEGY),)
 
-#: Bytes up to which the size announced by a header is accepted; beyond, a file may expand by at most `MAX_RATIO`. Real
-#: scenes reach a ratio of 3; deflate's limit is 1000, which a scene of equal splats reaches.
+#: A header may announce this many bytes, or more if the file is expanded by at most `MAX_RATIO`. Real scenes reach a
+#: ratio of 3; deflate's limit is 1000, which a scene of equal splats reaches.
 TRUSTED_SIZE, MAX_RATIO = 1 << 26, 200
 
 _RAW = -zlib_ng.MAX_WBITS
@@ -58,17 +58,17 @@ def gzip_member(
     *,
     comment: bytes = b"",
 ) -> Iterator[bytes]:
-    """Return one gzip member, piece by piece; the same bytes for any number of threads, and however the data are cut.
+    """Yield one gzip member; the same bytes for any number of threads, and for any division of the data into pieces.
 
-    Blocks are deflated separately, without a reference to one before, and end on a byte boundary with an empty stored
-    block, so that together they are one deflate stream.
+    Blocks are deflated separately and end on a byte boundary with an empty stored block, so that together they are one
+    deflate stream.
 
     Args:
-        pieces: bytes, or contiguous arrays, asked for a few blocks ahead.
-        runs: bytes of data of one kind, in order, and the ways to deflate them. A block holds data of one run, unless
-            all fit into a block.
-        level: of compression. Below the default, which means haste, no other is used, and above it no lower one.
-        comment: of the header, without a zero byte; empty for none.
+        pieces: bytes or contiguous arrays, consumed a few blocks ahead.
+        runs: sizes of consecutive data of one kind, and the ways to deflate them. A block holds data of one run, unless
+            all data fit into one block.
+        level: compression level. Below the default, all ways have this level; otherwise, they have at least this level.
+        comment: comment of the header, without a zero byte; empty for none.
     """
     total = sum(size for size, _ in runs)
     parts: list[tuple[int, tuple[Way, ...]]] = [(total, ((level, zlib_ng.Z_DEFAULT_STRATEGY),))]
@@ -104,9 +104,9 @@ def _packed(block: memoryview, way: Way, *, last: bool) -> bytes:
 
 
 def blocks_of_pieces(pieces: Iterable[Any], sizes: Iterable[int]) -> Iterator[memoryview]:
-    """Cut the data of pieces into blocks of these sizes, which may be 0; raises ValueError unless the sizes add up.
+    """Divide the data of pieces into blocks of given sizes; raises ValueError if the sizes do not add up.
 
-    A block within one piece is a view of it.
+    A block that lies within one piece is a view of it.
     """
     views = (memoryview(piece).cast("B") for piece in pieces if memoryview(piece).nbytes)
     view = memoryview(b"")
@@ -125,17 +125,17 @@ def blocks_of_pieces(pieces: Iterable[Any], sizes: Iterable[int]) -> Iterator[me
 
 
 def check_promise(total: int, file_size: int) -> None:
-    """Raise `PromiseError` if a header announces more bytes than a file of this size can expand to."""
+    """Raise `PromiseError` if a header announces more bytes than a file of this size can contain."""
     if total > TRUSTED_SIZE and total > MAX_RATIO * file_size:
         raise PromiseError(f"its header announces {total:,} bytes, more than a file of {file_size:,} bytes can hold")
 
 
 def zstd_frame(pieces: Iterable[Any], size: int, level: int) -> bytes:
-    """Return one zstd frame, with a checksum.
+    """Compress pieces, `size` bytes together, to one zstd frame with a checksum.
 
     Args:
-        pieces: bytes, or contiguous arrays, of `size` bytes together.
-        level: of deflate, 1 to 9, for which zstd's from 3 to 19 stand.
+        pieces: bytes or contiguous arrays.
+        level: level of deflate, 1 to 9, which is mapped to 3 to 19 of zstd.
     """
     import zstandard
 
@@ -148,20 +148,20 @@ try:
 except ImportError:
     _library = zlib_ng
 
-#: What unpackers raise on data that are no deflate stream.
+#: Errors of unpackers for data that are no deflate stream.
 INFLATE_ERRORS: tuple[Any, ...] = (zlib_ng.error, _library.error)  # the stubs take the classes for instances
 
-#: Bytes of the head of a member without fields.
+#: Bytes of a header without optional fields.
 _HEAD_SIZE = 10
-#: Bytes up to which a comment is read; sparklod's have some fifty.
+#: Longest comment that is read, bytes; those of sparklod have some fifty.
 MOST_COMMENT = 1 << 12
 
-#: Bytes of a file that are read at a time, and to which they are inflated at most.
+#: Bytes that are read from a file at a time, and most bytes that they are inflated to at a time.
 PIECE, _STEP = 1 << 17, 1 << 18
 
 
 def raw_unpacker() -> Any:
-    """Return what inflates a bare deflate stream; it raises `INFLATE_ERRORS`."""
+    """Return a decompressor of a bare deflate stream, which raises `INFLATE_ERRORS`."""
     return _library.decompressobj(-zlib_ng.MAX_WBITS)
 
 
@@ -169,12 +169,12 @@ class Inflate:
     """Reader of a gzip member of a file.
 
     Args:
-        file: open for reading at the beginning of the member; nobody else may use it until the last read.
+        file: binary file at the beginning of the member; nobody else may use it until the last read.
 
     Attributes:
-        comment: of the head of the member, or empty; None if the head has other fields, or too long a comment.
-        end: position in the file behind the member; None until the member has been read to its end.
-        behind: the first two bytes after the member, or fewer at the end of the file; none before `end`.
+        comment: comment in the header of the member, or empty; None if it is too long or there are other fields.
+        end: position behind the member in the file; None until the member has been read to its end.
+        behind: the first two bytes after the member, or fewer at the end of the file; empty before `end` is known.
     """
 
     def __init__(self, file: BinaryIO) -> None:
@@ -191,7 +191,7 @@ class Inflate:
             self.comment = comment if end else None
 
     def read(self, size: int) -> bytes | memoryview:
-        """Return the next `size` bytes, or fewer where the data ends; raises `FormatError` where they are corrupt."""
+        """Read the next `size` bytes, or fewer at the end of the data; raises `FormatError` if they are corrupt."""
         pieces = []
         while size > 0:
             if not self._rest:
@@ -212,7 +212,7 @@ class Inflate:
 
     def _all_pieces(self) -> Iterator[bytes]:
         """Yield the data in pieces, none of them empty."""
-        library = zlib_ng if self.comment is None else _library  # ISA-L misreads heads of which a read ends in a field
+        library = zlib_ng if self.comment is None else _library  # ISA-L misreads headers that continue in the next read
         unpacker, packed = library.decompressobj(zlib_ng.MAX_WBITS + 16), b""
         self._file.seek(self._start)
         while not unpacker.eof:
@@ -233,30 +233,24 @@ class Inflate:
         self.behind = (behind[:2] + self._file.read(2))[:2]
 
 
-class _Window:
-    """The next `size` bytes of a file."""
-
-    def __init__(self, file: BinaryIO, size: int) -> None:
-        self._file, self._left = file, size
-
-    def read(self, size: int) -> bytes:
-        data = self._file.read(min(size, self._left))
-        self._left -= len(data)
-        return data
-
-
 class Unzstd:
-    """Reader of a zstd frame, the next `packed` bytes of a file, that buffers little more than requested."""
+    """Reader of a zstd frame, the next `packed` bytes of a file, for a stream of this name in messages."""
 
     def __init__(self, file: BinaryIO, packed: int, name: str) -> None:
         import zstandard
 
+        def read(size: int) -> bytes:
+            nonlocal packed
+            data = file.read(min(size, packed))
+            packed -= len(data)
+            return data
+
         self._name, self._error = name, zstandard.ZstdError
-        window: Any = _Window(file, packed)
-        self._reader = zstandard.ZstdDecompressor().stream_reader(window, read_size=PIECE)
+        source: Any = SimpleNamespace(read=read)
+        self._reader = zstandard.ZstdDecompressor().stream_reader(source, read_size=PIECE)
 
     def read(self, size: int) -> bytes:
-        """Return the next `size` bytes, or fewer where the data ends; raises `FormatError` where they are corrupt."""
+        """Read the next `size` bytes, or fewer at the end of the data; raises `FormatError` if they are corrupt."""
         try:
             piece: bytes = self._reader.read(size)
         except self._error as error:

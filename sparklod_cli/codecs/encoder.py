@@ -1,7 +1,7 @@
-"""Writing a file in windows, whether its splats are in memory or not, and counting the values that its codes clamp.
+"""Encoding of files in windows, for splats in memory or not, and counts of the values that codes clamp.
 
 Each window is encoded alone, on any thread or machine, and its result stays in memory or in a store that machines
-share. The pieces of the file are then made of the results.
+share. The bytes of the file are then assembled from the results.
 """
 
 from __future__ import annotations
@@ -29,47 +29,48 @@ if TYPE_CHECKING:
 
         @property
         def options(self) -> WriteOptions:
-            """Options with nothing left open."""
+            """Settled options: none is None."""
 
         @property
         def ranges(self) -> tuple[CodeRange, ...]:
-            """Ranges of which the values beyond are counted; empty for no count."""
+            """Ranges beyond which values are counted; empty for no count."""
 
         def encode(self, splats: Splats, tree: LodTree | None, start: int) -> Encoded:
-            """Encode a window, and `tally` the values beyond the ranges as `CLAMPED`.
+            """Encode a window; the result has the `tally` of values beyond the ranges as `CLAMPED`.
 
             Args:
-                tree: of the window, whose children have the numbers of the file; None where the file has no tree.
+                tree: nodes of the window, with the indices of children in the file; None for a file without a tree.
                 start: number of the first splat; the start of one of `windows_of`.
             """
 
         def pieces(self, windows: Windows, *, threads: int, progress: Progress) -> Iterator[bytes]:
-            """Return the bytes of the file, piece by piece, made of the results of all windows."""
+            """Yield the bytes of the file, assembled from the results of all windows."""
 
         def keeping(self, stored: Any, unchanged: NDArray[np.bool_]) -> Encoder:
-            """Return an encoder that gives (N,) unchanged nodes their codes of a file, by the codec's `stored`."""
+            """Return an encoder that copies the codes of (N,) unchanged nodes from `stored` codes, see `Format`."""
 
 
-#: The result of a window: arrays by name.
+#: Result of a window: arrays by name.
 Encoded = dict[str, NDArray[Any]]
 
-#: Results of the windows of a file: returns an array by the number of the window and its name, as often as asked.
+#: Returns an array of the result of a window, by the number of the window and the name of the array.
 Windows = Callable[[int, str], NDArray[Any]]
 
-#: Name of the array that counts what a window clamps, see `tally`.
+#: Name of the array that counts the clamped values of a window, see `tally`.
 CLAMPED = "clamped"
 
 
 @dataclass(frozen=True)
 class CodeRange:
-    """Values of a column that a format holds without clamping them.
+    """Range of the values of a column that a format stores without clamping.
 
     Attributes:
-        column: of `Splats`.
+        column: column of `Splats`.
         low, high: smallest and largest value that is rounded to a code.
-        numbers: the first, and the one after the last, of the numbers of a splat that are meant; all by default.
-        zero: values below this are held as 0.
-        degree: of the SH that they are; 0 for other columns, or for SH of all degrees.
+        numbers: the range is that of these numbers of a splat, from the first to the one before the second; all by
+            default.
+        zero: values below this are stored as 0.
+        degree: degree of the SH; 0 for other columns, and for SH of all degrees.
     """
 
     column: str
@@ -80,7 +81,7 @@ class CodeRange:
     degree: int = 0
 
 
-#: What SPZ holds.
+#: Ranges of SPZ.
 SPZ_RANGES = tuple(CodeRange(column, low, high) for column, (low, high) in quantize.CLAMPS.items())
 
 
@@ -90,7 +91,7 @@ def windows_of(count: int) -> list[slice]:
 
 
 def results(encoder: Encoder, scene: Scene, threads: int, progress: Progress, stage: str) -> Iterator[Encoded]:
-    """Encode all windows of a scene in order, a few ahead; `stage` is the word for it that `progress` gets."""
+    """Encode all windows of a scene and yield the results in order; `stage` is the word for it in `progress`."""
     windows, tree = windows_of(len(scene)), scene.tree
     rows = ((scene.splats.take(part), None if tree is None else tree.rows(part), part.start) for part in windows)
     encoded = ordered_map(lambda arguments: encoder.encode(*arguments), rows, threads)
@@ -99,74 +100,75 @@ def results(encoder: Encoder, scene: Scene, threads: int, progress: Progress, st
         yield result
 
 
-#: Change of a splat's displayed colour, 0..1, from which on it is visible through those before it. Chosen.
+#: Smallest visible change of the displayed colour of a splat, 0..1. Chosen.
 STEP = 8 / 255
 
-#: Most of a basis function of SH of degree 1, which others exceed by little.
+#: Largest value of a basis function of SH of degree 1; those of other degrees are a little larger.
 BASIS = 0.5
 
-#: Counts of what lies beyond ranges, see `tally`.
+#: Result of `tally`.
 Tally = NDArray[np.float64]
 
 
 def tally(splats: Splats, ranges: Sequence[CodeRange], leaf: NDArray[np.bool_] | None = None) -> Tally:
-    """Count the values of splats that lie beyond ranges.
+    """Count the splats with values beyond ranges.
 
-    The loss of a leaf can be seen if a coordinate is clamped; if its colour, as it is displayed on black, changes by
-    `STEP` or more, as it is or by a coefficient of SH; or if it grows as a whole or shrinks. That a flat splat gets
-    thicker than a number that small cannot be seen.
+    The loss of a leaf is visible if a coordinate is clamped, if the largest scale is clamped, or if the colour changes
+    by `STEP` or more, displayed on black, by its base or by a coefficient of SH. Clamping a smaller scale only makes a
+    flat splat thicker, which is not visible.
 
     Args:
-        ranges: those of one column are side by side.
-        leaf: (n,) which of them are leaves; None for all.
+        ranges: ranges; those of one column are side by side.
+        leaf: (n,) mask of the leaves; None if all splats are leaves.
 
     Returns:
-        (ranges, 9) float64: splats below the range, above, and either; splats beyond any range of its column; the
-        least and the largest value, infinity and minus infinity without values; leaves with a visible loss below,
-        above, and either.
+        (ranges, 9) float64: numbers of splats below the range, above it, and either; number of splats beyond any range
+        of the column; least and largest value, infinity and minus infinity without values; numbers of leaves with a
+        visible loss below, above, and either.
     """
-    found = np.zeros((len(ranges), 9))
-    found[:, 4:6] = np.inf, -np.inf
+    counts = np.zeros((len(ranges), 9))
+    counts[:, 4:6] = np.inf, -np.inf
     for name in dict.fromkeys(each.column for each in ranges):
         column, either = getattr(splats, name).reshape(len(splats), -1), np.zeros(len(splats), np.bool_)
-        numbers = [number for number, each in enumerate(ranges) if each.column == name]
-        for number in numbers:
-            each = ranges[number]
+        rows = [row for row, each in enumerate(ranges) if each.column == name]
+        for row in rows:
+            each = ranges[row]
             values = column[:, slice(*each.numbers)]
             if not values.size:
                 continue
             if each.zero:
                 values = np.where(values < each.zero, each.low, values)
-            found[number, 4:6] = values.min(), values.max()
-            if found[number, 4] >= each.low and found[number, 5] <= each.high:
+            counts[row, 4:6] = values.min(), values.max()
+            if counts[row, 4] >= each.low and counts[row, 5] <= each.high:
                 continue
             below, above = _rows_with(values < each.low), _rows_with(values > each.high)
-            either |= below | above
-            found[number, :3] = [np.count_nonzero(mask) for mask in (below, above, below | above)]
-            rows = np.flatnonzero(below | above if leaf is None else (below | above) & leaf)
-            seen = rows[_is_seen(each, values[rows], splats.opacity[rows])]
-            found[number, 6:] = np.count_nonzero(below[seen]), np.count_nonzero(above[seen]), len(seen)
-        found[numbers, 3] = np.count_nonzero(either)
-    return found
+            beyond = below | above
+            either |= beyond
+            counts[row, :3] = [np.count_nonzero(mask) for mask in (below, above, beyond)]
+            leaves = np.flatnonzero(beyond if leaf is None else beyond & leaf)
+            seen = leaves[_is_visible(each, values[leaves], splats.opacity[leaves])]
+            counts[row, 6:] = np.count_nonzero(below[seen]), np.count_nonzero(above[seen]), len(seen)
+        counts[rows, 3] = np.count_nonzero(either)
+    return counts
 
 
 @np.errstate(over="ignore")  # of numbers near the end of float32
-def _is_seen(each: CodeRange, values: FloatArray, opacity: FloatArray) -> NDArray[np.bool_]:
-    """Return (n,) whether the loss can be seen of leaves with values, (n, K), beyond a range."""
+def _is_visible(each: CodeRange, values: FloatArray, opacity: FloatArray) -> NDArray[np.bool_]:
+    """Return an (n,) mask of the leaves whose loss is visible if their (n, K) values are clamped to a range."""
     if each.column == "center":
         return np.ones(len(values), np.bool_)
     if each.column == "scale":
         return (values.max(axis=1) < each.low) | (values.max(axis=1) > each.high)
-    alpha, held = opacity[:, None], np.clip(values, each.low, each.high)
+    alpha, clamped = opacity[:, None], np.clip(values, each.low, each.high)
     if each.column == "rgb":
-        change = np.clip(alpha * values, 0, 1) - np.clip(alpha * held, 0, 1)
+        change = np.clip(alpha * values, 0, 1) - np.clip(alpha * clamped, 0, 1)
     else:
-        change = BASIS * alpha * (values - held)
+        change = BASIS * alpha * (values - clamped)
     return _rows_with(np.abs(change) >= STEP)
 
 
 def _rows_with(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (N,) which rows of an (N, K) mask have a true value; where few do, five times as fast as `any`."""
+    """Return `mask.any(axis=1)` of an (N, K) mask; five times as fast if few values are true."""
     rows = np.zeros(len(mask), np.bool_)
     rows[np.flatnonzero(mask) // mask.shape[1]] = True
     return rows

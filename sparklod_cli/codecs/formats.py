@@ -19,15 +19,13 @@ from ..system.untrusted import keys_of_object, printable
 if TYPE_CHECKING:
     from .spark_codings import SplatEncoding
 
-#: Bytes at the beginning of a file by which its format is recognized, and of a JSON object, whose first value may be
-#: long.
+#: Bytes at the beginning of a file from which its format is recognized; more for JSON, whose first value may be long.
 HEAD, JSON_HEAD = 1 << 16, 1 << 22
 
-
-#: The name of the format that can be read chunk by chunk.
+#: Name of the format that can be read chunk by chunk.
 RAD = "RAD"
 
-#: Beginning of a zip that is not empty.
+#: First bytes of a zip that is not empty.
 ZIP = b"PK\x03\x04"
 
 
@@ -36,32 +34,31 @@ class Format:
     """A file format.
 
     Attributes:
-        name: for display.
-        module: in this package; has `open_content(source) -> Reader`, which raises `FormatError` if the file is of
-            another format, cut short or corrupt.
-        endings: of the names of files that are written, suffixes or the name in `unbundled`; empty if it is only read.
-            Its module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
-            `settled(scene, options) -> WriteOptions`, the options with nothing left open, which raises `FormatError`
-            if the scene cannot be written; and, if it clamps values, `held(options, sh_degree)`, the
-            `encoder.CodeRange`s that it can hold.
-        unbundled: the name of the first of the files as which a scene can also be written, all in one folder; None if
-            there is no such way. Its module then has `encode_files(scene, options, *, threads, progress)`, too, which
-            yields the name and the bytes of each, this one last.
-        trees: it can be written with a Level-of-Detail tree. Its `settled` then takes the `Statistics`, too, that
-            `needed(options)` names; `encoder(scene, options, *, counting, threads, progress)` gives its
-            `encoder.Encoder`, and `stored(source, options)` the codes of a file, for `Encoder.keeping`, and the
-            options, which have the value of the file where they leave a choice open.
-        suffixes: lower case, with the dot.
-        beginning: a regular expression that the first bytes of its files match; None for formats without one.
-        keys: that its files have at the top level, which are JSON objects; empty if they are not. Without `beginning`
-            and `keys`, any bytes are possible, so that only the suffix decides.
-        companions: its files refer to others beside them, which the `open_companion` of a source opens.
-        folders: those may be in folders there.
-        parts: the units that viewers choose instead of single splats: "levels" of detail, or "tiles" that replace each
-            other; None if its files have neither. Its module then has `decode_parts(file, *, threads,
-            progress, open_companion)`, which gives a `DetailScene` or a `TileScene`, and `encode_files` of such a
-            scene, as above.
-        bare: its files hold only splats, and no notes, see `reader.note_of`.
+        name: name for display.
+        module: module in this package, with `open_content(source) -> Reader`, which raises `FormatError` for a file
+            of another format, and for one that is cut short or corrupt.
+        suffixes: suffixes of files that are read, in lower case and with the dot.
+        beginning: regular expression that matches the first bytes of files; None for formats without one.
+        keys: keys at the top level of files that are JSON objects; else empty. If there is neither `beginning` nor
+            `keys`, files may begin with any bytes, and only the suffix decides.
+        endings: ends of the names of files that are written, which are suffixes or `unbundled`; empty for formats that
+            are only read. The module also has `encode(scene, options, *, threads, progress) -> Iterator[bytes]`;
+            `settled(scene, options) -> WriteOptions`, which replaces None in the options by values for the scene, and
+            raises `FormatError` if it cannot be written; and, if values are clamped, `held(options, sh_degree)`, the
+            `encoder.CodeRange`s of values that are not.
+        unbundled: name of the file that names the others, for a format that can also be written as several files in
+            one folder; else None. The module then also has `encode_files(scene, options, *, threads, progress)`,
+            which yields the name and the bytes of each file, this one last.
+        trees: files can be written with a Level-of-Detail tree. `settled` then also takes the `Statistics` that
+            `needed(options)` names; `encoder(scene, options, *, counting, threads, progress)` returns an
+            `encoder.Encoder`; and `stored(source, options)` returns the codes of a file, for `Encoder.keeping`, and
+            the options, in which the values of the file replace None.
+        companions: files name other files beside them, which the `open_companion` of a source opens.
+        folders: companions may be in folders.
+        parts: units that viewers choose instead of single splats: "levels" of detail, or "tiles" that replace each
+            other; None for single splats. The module then has `decode_parts(file, *, threads, progress,
+            open_companion)`, which returns a `DetailScene` or a `TileScene`, and `encode_files` takes such a scene.
+        bare: files store splats only, and no notes, see `reader.note_of`.
     """
 
     name: str
@@ -87,8 +84,8 @@ class Format:
         return import_module(f".{self.module}", __package__)
 
 
-#: The formats in the order in which they are tried: compressed PLY is PLY too. A .splat file begins with any float, a
-#: .hier file with any number of splats and a float, so no beginning may have two bytes or fewer.
+#: The formats in the order in which they are tried: compressed PLY is PLY, too. No beginning may have two bytes or
+#: fewer: a .splat file begins with any float, and a .hier file with any number of splats and a float.
 FORMATS = (
     Format(
         "compressed PLY",
@@ -99,7 +96,7 @@ FORMATS = (
     Format("PLY", "ply", (".ply",), rb"ply[\r\n]", (".ply",)),
     # Gzipped up to version 3.
     Format("SPZ", "spz", (".spz",), rb"\x1f\x8b\x08[\0-\x1f]|NGSP", (".spz",), trees=True),
-    # RADC begins a chunk, which the codec refuses with what to give instead.
+    # A file that begins with RADC is a chunk; the error of the codec says which file to give instead.
     Format(RAD, "rad.rad_writer", (".rad",), rb"RAD[0C]", (".rad",), trees=True, companions=True),
     Format(
         "Streamed SOG",
@@ -121,7 +118,7 @@ FORMATS = (
         parts="tiles",
         keys=("geometricError",),
     ),
-    # GLB as JSON, whose keys are in any order; a meta.json of SOG is JSON, too.
+    # JSON with keys in any order; a meta.json of SOG is JSON, too.
     Format(
         "glTF",
         "gltf",
@@ -144,13 +141,13 @@ FORMATS = (
         keys=("means", "quats"),
     ),
     Format("GLB", "gltf", (".glb",), rb"glTF", (".glb",), companions=True, folders=True),
-    # Version 0.1 on, as a float denormal, and fewer than 2 ** 24 sections, which as a float would be, too.
+    # Version 0.1 or later, which is a denormal as a float, and fewer than 2 ** 24 sections, which are denormal, too.
     Format("KSPLAT", "ksplat", (".ksplat",), rb"\0[\x01-\xff]\0\0...\0"),
     Format("HIER", "hier", (".hier",), None),
     Format("SPLAT", "splat", (".splat",), None, (".splat",), bare=True),
 )
 
-#: The formats that can be written, by how the name of the file ends, see `Format.endings`.
+#: The formats that can be written, by the end of the file name, see `Format.endings`.
 WRITABLE = {ending: form for form in FORMATS for ending in form.endings}
 
 #: SPZ versions that can be written, those that hold trees, and the default; see docs/decisions/05-spz.md.
@@ -162,7 +159,7 @@ MAX_FRACTIONAL_BITS = 24
 #: Deflate levels, and the default; measured in docs/decisions/05-spz.md.
 MIN_COMPRESSION, MAX_COMPRESSION, DEFAULT_COMPRESSION = 1, 9, 5
 
-#: Entries of a palette of spherical harmonics: labels have 16 bits in RAD and in SOG.
+#: Most entries of a palette of spherical harmonics: labels have 16 bits in RAD and in SOG.
 MAX_SH_CODES = 65_536
 SH_CODES = whole(2, MAX_SH_CODES)
 
@@ -176,7 +173,7 @@ def _bits(text: str) -> int | None:
     return None if text == "auto" else int(text)
 
 
-#: The encodings that each property of RAD may be in, as Spark reads them; the first is the one that Spark writes.
+#: Encodings of each property of RAD that Spark reads; the first is the one that Spark writes.
 RAD_ENCODINGS = {
     "center": ("f32_lebytes", "f32", "f16_lebytes", "f16"),
     "alpha": ("f16", "r8", "f32"),
@@ -186,20 +183,20 @@ RAD_ENCODINGS = {
     "sh": ("s8", "s8_delta", "r8", "r8_delta", "f16", "f32"),
 }
 
-#: Leaves the choice of an encoding to the writer, which goes by the scene.
+#: The writer chooses an encoding that suits the scene.
 AUTO = "auto"
 
-#: The values of their options.
+#: Values of the options of RAD encodings.
 RAD_CHOICES = {name: (AUTO, *encodings) for name, encodings in RAD_ENCODINGS.items()}
 
 
 @dataclass(frozen=True)
 class RadOptions(CheckedSettings):
-    """Options of RAD files; encodings are explained in `rad.property_codings`.
+    """Options of RAD files; for encodings see `rad.property_codings`.
 
     Attributes:
-        chunked: write each chunk into a file of its own.
-        ranges: of the codes; None for those that suit the scene.
+        chunked: write each chunk to a file of its own.
+        ranges: ranges of the codes; None for ranges that suit the scene.
     """
 
     HEADING: ClassVar[str] = "RAD"
@@ -242,15 +239,13 @@ class SogOptions(CheckedSettings):
 
 @dataclass(frozen=True)
 class WriteOptions(CheckedSettings):
-    """Options of splat files. PLY and .splat have none of these choices, and ignore all of them.
+    """Options of splat files; PLY and .splat ignore all of them.
 
     Attributes:
-        rad: of RAD.
-        sog: of SOG.
         sh_bits: upper bits kept of each SH byte of SPZ, 4 to 8; None for as many as colours need (`statistics.enough`).
             Merged splats keep 4, and 5 of degree 1, as other writers do with all splats.
-        covering: opacities make up for the rounding of scales, see `quantize.compensated`; False where splats of a tree
-            are written in another format, so that they keep their opacities.
+        covering: opacities compensate for the rounding of scales, see `quantize.compensated`; False when a tree is
+            converted to another format, so that opacities stay the same.
     """
 
     HEADING: ClassVar[str] = "File format"
@@ -281,39 +276,39 @@ class WriteOptions(CheckedSettings):
     )
 
 
-#: Options that leave every choice to the writer.
+#: Default options: the writer makes every choice.
 DEFAULTS = WriteOptions()
 
 
 #: Layouts of `convert --layout`, see `layouts.pack_layout`; docs/formats/memory.md has the arrays of each.
 ENCODINGS = ("packed", "ext", "lodtree", "texture")
 
-#: Layouts after which `spark_nodes.nodes` measures nodes, as Spark does once it has loaded a file: ExtSplats,
-#: PackedSplats of a file that it loads whole, and those of a RAD file that it streams.
+#: Layouts of splats in Spark, for which `spark_nodes.nodes` measures nodes: ExtSplats, PackedSplats of a file that is
+#: loaded whole, and those of a RAD file that is streamed.
 LOADED = ("ext", "packed", "packed-pages")
 
-#: Encodings whose rounding `losses.after` shows: PackedSplats as Spark has them for a scene, ExtSplats, and SPZ and RAD
-#: as build-lod writes them.
+#: Encodings whose rounding `losses.after` simulates: PackedSplats with Spark's ranges, ExtSplats, and SPZ and RAD as
+#: build-lod writes them.
 ROUND_TRIPS = ("packed", "ext", "spz", "rad")
 
-#: Precisions of the nodes that cuts are found with: the file's, its half floats, and what Spark has in each layout.
+#: Precisions of the nodes of a traversal: that of the file, half floats, and those of Spark's layouts.
 PRECISIONS = ("float32", "float16", *LOADED)
 
-#: Suffix of dumps with a header.
+#: Suffix of files of arrays.
 NPZ = ".npz"
 
-#: Suffixes of dumps without one: nothing but the words of all arrays, one after the other.
+#: Suffixes of files of arrays without a header: the words of all arrays, one array after the other.
 RAW_SUFFIXES = (".bin", ".raw")
 
 
 def ending_of(name: str) -> str:
-    """Return how a name ends, as `WRITABLE` knows it, in lower case: "meta.json", or the suffix, which may be other."""
+    """Return the end of a file name as in `WRITABLE`, in lower case: "meta.json", or the suffix, known or not."""
     name = name.lower()
     return name if any(name == form.unbundled for form in FORMATS) else PurePath(name).suffix
 
 
 def head_of(file: BinaryIO) -> bytes:
-    """Read the bytes at the beginning of a file by which its format is recognized, and return to it."""
+    """Read the first bytes of a file, from which its format is recognized, and return to its beginning."""
     head = file.read(HEAD)
     if len(head) == HEAD and _keys(head) and sniff(head, "") is None:
         head += file.read(JSON_HEAD - HEAD)
@@ -321,15 +316,15 @@ def head_of(file: BinaryIO) -> bytes:
     return head
 
 
-#: The keys of the object that a file begins with, see `keys_of_object`: several functions ask for those of one head.
+#: `keys_of_object`, cached since several functions need the keys of the same head.
 _keys = functools.lru_cache(1)(keys_of_object)
 
 
 def sniff(head: bytes, suffix: str) -> Format | None:
-    """Return the format of a file by its first bytes, see `head_of`, or else by its suffix; None if that is not known.
+    """Recognize the format of a file by its first bytes, see `head_of`, or else by its suffix; None if it is unknown.
 
-    The suffix decides only for formats that may begin with any bytes, and not if the file is recognized as something
-    else; and that of `NPZ` tells arrays from a scene, which are a zip both.
+    The suffix decides only for formats that may begin with any bytes, unless the file is recognized as something else.
+    The suffix `NPZ` distinguishes arrays from a scene: both are zips.
     """
     if not head or (head.startswith(ZIP) and suffix.lower() == NPZ):
         return None
@@ -343,22 +338,21 @@ def sniff(head: bytes, suffix: str) -> Format | None:
     return next((form for form in FORMATS if form.unmarked and suffix.lower() in form.suffixes), None)
 
 
-#: What a clone that was made without Git LFS has in place of a file, of any kind.
+#: Description, and regular expression, of the placeholder of a file in a clone that was made without Git LFS.
 POINTER = "a Git LFS pointer; run git lfs pull to get the file"
 POINTED = rb"version https://git-lfs\.github\.com/spec/v1\s"
 
 #: Bytes at the beginning of a file that suffice to recognize a pointer.
 SHORT = 64
 
-#: Keys of an unknown object that a message names, and the characters that they may take.
+#: Most keys of an unknown JSON object that a message names, and most characters of them.
 FEW, QUOTED = 5, 100
-
 
 _CAMERAS = "a file of cameras; give it as --camera-path"
 
-#: Kinds of files that hold no splats, or none that are read, in the order in which they are tried: a description and
-#: advice, to follow "not a splat file, but"; a regular expression that the first bytes match, None if any JSON object
-#: with the keys is one; and the keys at the top level.
+#: Kinds of files without splats, or with splats that are not read, in the order in which they are tried: a description
+#: and advice, to follow "not a splat file, but"; a regular expression that matches the first bytes, None for any JSON
+#: object with the keys; and the keys at the top level.
 LOOKALIKES: tuple[tuple[str, bytes | None, tuple[str, ...]], ...] = (
     (POINTER, POINTED, ()),
     ("a web page, perhaps of a download that failed", rb"\s*<(?i:!doctype html|html)", ()),
@@ -374,12 +368,12 @@ LOOKALIKES: tuple[tuple[str, bytes | None, tuple[str, ...]], ...] = (
 
 
 def lookalike_of(head: bytes) -> str | None:
-    """Describe a file of no known format by its first bytes; None if they do not identify it."""
+    """Describe a file of no known format by its first bytes; None if they identify nothing."""
     keys = _keys(head)
-    for text, beginning, wanted in LOOKALIKES:
+    for text, beginning, required in LOOKALIKES:
         if beginning is not None and re.match(beginning, head):
             return text
-        if wanted and set(wanted) <= set(keys):
+        if required and set(required) <= set(keys):
             return text
     if not keys:
         return None
@@ -388,16 +382,16 @@ def lookalike_of(head: bytes) -> str | None:
 
 
 def is_pointer(head: bytes) -> bool:
-    """Return True if a file that begins so is a pointer of Git LFS."""
+    """Return whether a file with these first bytes is a pointer of Git LFS."""
     return re.match(POINTED, head) is not None
 
 
-# Names of files, as Spark and PlayCanvas's tools choose them.
+# Names of files, which are those of Spark and of PlayCanvas's tools.
 
-#: Suffixes of a RAD file, and of a chunk that is a file of its own.
+#: Suffixes of a RAD file, and of a chunk in a file of its own.
 RAD_SUFFIX, RAD_CHUNK_SUFFIX = ".rad", ".radc"
 
-#: The file of an unpacked SOG that names its images, and these by texture, in the order in which it names them.
+#: The file of an unpacked SOG that names its images, and the images of each texture, in the order of that file.
 META = "meta.json"
 SOG_IMAGES = {
     "means": ("means_l.webp", "means_u.webp"),
@@ -411,7 +405,7 @@ SOG_IMAGES = {
 MANIFEST = "lod-meta.json"
 
 #: The folder of the environment of a Streamed SOG, and its file: a bundled SOG, the only form that both PlayCanvas and
-#: Babylon.js read. Former outputs have it unpacked in the same folder.
+#: Babylon.js read. Older versions wrote it unpacked to the same folder.
 ENVIRONMENT = "env"
 ENVIRONMENT_FILE = f"{ENVIRONMENT}/env.sog"
 
@@ -427,18 +421,18 @@ _CHUNK_FOLDER = re.compile(r"(?:0|[1-9]\d{0,8})_(?:0|[1-9]\d{0,8})", re.ASCII)
 
 
 def rad_chunk_name(stem: str, number: int) -> str:
-    """Return the name of the file of a chunk."""
+    """Return the file name of a chunk of a RAD file with this stem."""
     return f"{stem}-{number}{RAD_CHUNK_SUFFIX}"
 
 
 def rad_chunk_number(name: str, stem: str) -> int | None:
-    """Return the number of the chunk whose file has this name; None for other names."""
+    """Return the number of a chunk by its file name; None for other names."""
     match = re.fullmatch(r"(0|[1-9][0-9]{0,8})" + re.escape(RAD_CHUNK_SUFFIX), name.removeprefix(f"{stem}-"))
     return int(match[1]) if match and name.startswith(f"{stem}-") else None
 
 
 def sog_image_number(name: str) -> int | None:
-    """Return the number of the image of a SOG whose file has this name, over all textures; None for other names."""
+    """Return the number of an image of a SOG, counted over all textures, by its file name; None for other names."""
     return _ALL_IMAGES.index(name) if name in _ALL_IMAGES else None
 
 
@@ -448,27 +442,27 @@ def chunk_folder(level: int, number: int) -> str:
 
 
 def is_chunk_folder(name: str) -> bool:
-    """Return True if a folder has the name of one of a Streamed SOG."""
+    """Return whether a name is that of a folder of a Streamed SOG."""
     return name == ENVIRONMENT or _CHUNK_FOLDER.fullmatch(name) is not None
 
 
 def is_in_manifest(name: str) -> bool:
-    """Return True if the manifest of an output could name a file: the meta.json of a chunk, or the environment."""
+    """Return whether the manifest of a Streamed SOG may name a file: the meta.json of a chunk, or the environment."""
     folder, _, file = name.partition("/")
     return name == ENVIRONMENT_FILE or (is_chunk_folder(folder) and file == META)
 
 
 def is_of_streamed_sog(name: str) -> bool:
-    """Return True if a file could be of an output: named by its manifest, or an image in a folder of it."""
+    """Return whether a file may belong to a Streamed SOG: one that the manifest may name, or an image of a chunk."""
     folder, _, file = name.partition("/")
     return is_in_manifest(name) or (is_chunk_folder(folder) and sog_image_number(file) is not None)
 
 
 def is_of_tileset(name: str) -> bool:
-    """Return True if a file could be of an output of 3D Tiles: a tile or a nested tileset in their folder."""
+    """Return whether a file may belong to 3D Tiles: a tile or a nested tileset in their folder."""
     return _TILE.fullmatch(name) is not None
 
 
 def folders_of(names: Collection[str]) -> list[str]:
-    """Return the folders of files, by their names."""
+    """Return the distinct folders in the paths of files, sorted."""
     return sorted({folder for folder, mark, _ in (name.partition("/") for name in names) if mark})

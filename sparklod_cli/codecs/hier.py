@@ -1,8 +1,7 @@
 """Hierarchies of hierarchical-3d-gaussians (.hier), read as the splats of full detail.
 
 A file has the columns of all splats one after the other, then the nodes of the tree, each of which names a run of
-splats.
-Facts: `hierarchy_loader.cpp`, `writer.cpp` and `traversal.cpp` of graphdeco-inria/gaussian-hierarchy.
+splats. Sources: `hierarchy_loader.cpp`, `writer.cpp` and `traversal.cpp` of graphdeco-inria/gaussian-hierarchy.
 """
 
 from __future__ import annotations
@@ -22,25 +21,24 @@ from ..system.threads import BLOCK_ROWS, blocks_of, ordered_map
 from . import quantize
 from .reader import OpenFile, Reader, RowBuffer, rows_of
 
-#: Before the columns, the number of splats, negative where numbers are halves; before the nodes, their number.
+#: Type of the number of splats, before the columns and negative if numbers are halves, and of that of nodes.
 COUNT = np.dtype("<i4")
 
-#: A node: it has `leaves` splats of the scene from `start` on, and then `merged` splats of its children.
+#: A node: `leaves` splats of the scene from `start` on, then `merged` splats, which stand for its children.
 NODE = np.dtype([(name, "<i4") for name in ("depth", "parent", "start", "leaves", "merged", "first_child", "children")])
 HALF_NODE = np.dtype(
     [(name, "<i4") for name in ("parent", "start", "first_child")]
     + [(name, "<i2") for name in ("depth", "children", "leaves", "merged")]
 )
 
-#: Numbers of the box of a node: the lowest and the highest corner, of four numbers each. They are not read.
+#: Numbers of the box of a node, which are not read: the lowest and the highest corner, of four numbers each.
 BOX_NUMBERS = 8
-
 
 #: SH degree of all files.
 DEGREE = 3
 
-#: The columns in the order of the file: the numbers of a splat, whether they are floats even where the file has halves,
-#: and the decoders of (n, numbers) values into columns of `Splats`.
+#: The columns in the order of the file: numbers per splat, whether they are floats even in a file of halves, and the
+#: decoders of (n, numbers) values to columns of `Splats`.
 COLUMNS: tuple[tuple[int, bool, dict[str, Callable[[FloatArray], FloatArray]]], ...] = (
     (3, True, {"center": np.asarray}),
     (4, False, {"quat_xyzw": lambda wxyz: normalized_quat(wxyz)[:, [1, 2, 3, 0]]}),
@@ -73,22 +71,22 @@ def open_content(source: OpenFile) -> Reader:
     leaves = _leaves(source, nodes_at + COUNT.itemsize, node, nodes, count)
 
     def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
-        @np.errstate(over="ignore", invalid="ignore")  # whether numbers are valid is for others to say
+        @np.errstate(over="ignore", invalid="ignore")  # invalid numbers are reported later
         def read(part: slice) -> int:
             first, last = np.searchsorted(rows, [part.start, part.stop])
             splats = target.splats.take(slice(first, last))
-            some = rows[first:last] - part.start
+            selected = rows[first:last] - part.start
             for (_, _, decoders), row_type, start in zip(COLUMNS, types, starts[:-1], strict=True):
-                between = rows_of(source.read_at, int(start), row_type, part.start, part.stop, count)
-                values = np.concatenate([values for _, values in between])[some].astype(np.float32)
+                blocks = rows_of(source.read_at, int(start), row_type, part.start, part.stop, count)
+                values = np.concatenate([values for _, values in blocks])[selected].astype(np.float32)
                 for name, decode in decoders.items():
                     getattr(splats, name)[:] = decode(values)
             return target.start + int(last)
 
         rows = leaves[target.start : target.stop]
         if len(rows):
-            around = int(rows[0]), int(rows[-1]) + 1
-            parts = (slice(around[0] + at.start, around[0] + at.stop) for at in blocks_of(around[1] - around[0]))
+            begin, stop = int(rows[0]), int(rows[-1]) + 1
+            parts = (slice(begin + part.start, begin + part.stop) for part in blocks_of(stop - begin))
             for done in ordered_map(read, parts, threads):
                 progress("reading", done, len(leaves), "splat")
 
@@ -105,12 +103,12 @@ def _count(source: OpenFile, at: int) -> int:
 def _leaves(source: OpenFile, at: int, node: np.dtype[Any], nodes: int, count: int) -> NDArray[np.int64]:
     """Return the splats of full detail, ascending: leaves of all nodes, and merged splats of nodes without children.
 
-    Nodes of hierarchies that were cut to a chunk may have lost their children.
+    A hierarchy that was divided into chunks may have nodes without their children.
     """
     runs = [np.empty((0, 2), np.int64)]
-    for _, some in rows_of(source.read_at, at, node, 0, nodes, nodes, "nodes"):
+    for _, block in rows_of(source.read_at, at, node, 0, nodes, nodes, "nodes"):
         start, leaves, merged, depth, children, first_child = (
-            some[name].astype(np.int64) for name in ("start", "leaves", "merged", "depth", "children", "first_child")
+            block[name].astype(np.int64) for name in ("start", "leaves", "merged", "depth", "children", "first_child")
         )
         wrong = (np.minimum.reduce([start, leaves, merged, children]) < 0) | (start + leaves + merged > count)
         wrong |= (children > 0) & ((first_child < 1) | (first_child + children > nodes))

@@ -48,13 +48,13 @@ SECTION = np.dtype(
 #: side.
 LEVELS = (("<f4", "<f4", "<f4", 1), ("<u2", "<f2", "<f2", 32767), ("<u2", "<f2", "u1", 32767))
 
-#: Highest SH degree: that of Spark's and splat-transform's readers; mkkellogg's own viewer writes up to 2.
+#: Highest SH degree, that of Spark's and splat-transform's readers; mkkellogg's own viewer writes up to 2.
 MAX_DEGREE = 3
 
-#: Bytes of SH mean -1.5..1.5 if the header gives no range.
+#: Bytes of SH stand for -1.5..1.5 if the header has no range.
 DEFAULT_SH = 1.5
 
-#: Place of coefficient k of channel c among the SH values of a splat: within a degree all of red come first.
+#: Index of coefficient k of channel c in the SH of a splat, in which all of red come first within a degree.
 SH_PLACES = np.array(
     [
         3 * COEFFICIENTS[degree - 1] + c * (2 * degree + 1) + k
@@ -66,7 +66,7 @@ SH_PLACES = np.array(
 
 
 def row_type(level: int, sh_degree: int) -> np.dtype[Any]:
-    """Return the type of a splat's row."""
+    """Return the type of the row of a splat."""
     center, real, sh, _ = LEVELS[level]
     return np.dtype(
         [
@@ -82,14 +82,14 @@ def row_type(level: int, sh_degree: int) -> np.dtype[Any]:
 
 @dataclass(frozen=True)
 class KsplatSection:
-    """Place of a section, and coding of its centres.
+    """Position of a section, and coding of its centres.
 
     Attributes:
-        first: index of its first splat in the scene.
-        offset, end: positions in the file of its first row and after its last.
+        first: index of the first splat in the scene.
+        offset, end: positions in the file of the first row and of the byte after the last row.
         middles: (buckets, 3) centres of the buckets, world units.
         ends: (buckets,) number of splats up to the end of each bucket.
-        step: width of a step, world units; `steps` of them lead from a bucket's low corner to its middle.
+        step: width of a step, world units; there are `steps` steps from the low corner of a bucket to its middle.
     """
 
     first: int
@@ -125,28 +125,28 @@ def open_content(source: OpenFile) -> Reader:
     def rows(start: int, stop: int) -> Iterator[Rows]:
         for section in sections:
             first, last = max(start - section.first, 0), min(stop - section.first, section.count)
-            for part, some in rows_of(source.read_at, section.offset, section.row_type, first, last, section.count):
-                yield slice(section.first + part.start, section.first + part.stop), some
+            for part, block in rows_of(source.read_at, section.offset, section.row_type, first, last, section.count):
+                yield slice(section.first + part.start, section.first + part.stop), block
 
     @np.errstate(invalid="ignore", over="ignore")  # absurd numbers overflow
     def unpack(target: RowBuffer, block: Rows) -> int:
-        part, some = block
+        part, stored = block
         splats = target.rows(part)
         section = sections[bisect(firsts, part.start) - 1]
-        splats.center[:] = some["center"]
+        splats.center[:] = stored["center"]
         if level:  # steps from the low corner of a bucket
             number = np.arange(part.start - section.first, part.stop - section.first)
             middles = section.middles[np.searchsorted(section.ends, number, side="right")]
             splats.center[:] = (splats.center - np.float32(section.steps)) * section.step + middles
-        splats.scale[:] = some["scale"]
-        splats.quat_xyzw[:] = normalized_quat(some["quat_wxyz"].astype(np.float32))[:, [1, 2, 3, 0]]
-        splats.rgb[:] = quantize.decode_unorm8(some["rgb"])
-        splats.opacity[:] = quantize.decode_unorm8(some["opacity"])
-        values = some["sh"][:, SH_PLACES[: some["sh"].shape[1]]].astype(np.float32)
+        splats.scale[:] = stored["scale"]
+        splats.quat_xyzw[:] = normalized_quat(stored["quat_wxyz"].astype(np.float32))[:, [1, 2, 3, 0]]
+        splats.rgb[:] = quantize.decode_unorm8(stored["rgb"])
+        splats.opacity[:] = quantize.decode_unorm8(stored["opacity"])
+        values = stored["sh"][:, SH_PLACES[: stored["sh"].shape[1]]].astype(np.float32)
         if level == 2:
             values = quantize.of_range(values / np.float32(255), low, high)
         coefficients = values.shape[1] // 3
-        splats.sh[:, :coefficients] = values.reshape(len(some), coefficients, 3)
+        splats.sh[:, :coefficients] = values.reshape(len(stored), coefficients, 3)
         splats.sh[:, coefficients:] = 0  # the degree of other sections may be higher
         return part.stop
 

@@ -1,4 +1,4 @@
-"""Losses of splats: values that codes clamp, in files, after a round trip through an encoding, in Spark's two layouts.
+"""Losses of splats: values that files clamp, rounding by an encoding, and the choice between Spark's two layouts.
 
 ExtSplats clip SH: a coefficient keeps between half and all of its largest channel. PackedSplats have centres of float16
 and clamp base colours to 0..1 and SH to -1..1. So strong SH look better as PackedSplats, colours beyond 0..1 and
@@ -26,22 +26,24 @@ from .formats import WRITABLE, Format, WriteOptions
 from .reader import decode_file
 from .spark_codings import SplatEncoding
 
-#: Share of leaves from which on a visible loss of each matters, by column. Measured: with 0.36 % of colours clamped,
+#: Share of leaves with a visible loss that users are told of, by column. Measured: with 0.36 % of colours clamped,
 #: pictures of meadow change by up to 36 steps of 255 (61 dB); with 2.4 % of SH, those of playbot by up to 7 (71 dB).
 MANY = {"scale": 0.001, "rgb": 0.001, "sh": 0.05}
 
 
 @dataclass(frozen=True)
 class Clamp:
-    """Values of a column that lie beyond one end of the range of their code, or both of a range around 0.
+    """Values of a column beyond one end of the range of their code, or beyond both ends of a range around 0.
 
     Attributes:
-        column: of `Splats`: center, scale, rgb or sh.
-        above: whether they lie above the upper end; otherwise below the lower one.
-        farthest: the value farthest beyond the end.
-        degree: as in `CodeRange`.
-        both: the range is -end to end; the values lie beyond either, and `farthest` is a magnitude.
-        visible: number of leaves whose loss can be seen, see `tally`.
+        column: column of `Splats`: center, scale, rgb or sh.
+        above: the values lie above the upper end; otherwise below the lower one.
+        splats: number of splats with such values.
+        end: end of the range.
+        farthest: value farthest beyond the end.
+        degree: see `CodeRange`.
+        both: the range is -end..end, the values lie beyond either end, and `farthest` is a magnitude.
+        visible: number of leaves with a visible loss, see `tally`.
     """
 
     column: str
@@ -54,47 +56,43 @@ class Clamp:
     visible: int = 0
 
 
-#: Values of a scene that writing clamps: number of splats by column of `Splats`, and the ends of their ranges.
+#: Values that writing clamps: number of splats by column of `Splats`, and the clamps.
 Clamps = tuple[dict[str, int], tuple[Clamp, ...]]
 
 
 def clamp_matters(column: str, *, above: bool, visible: int, leaves: int) -> bool:
-    """Return whether a person should know of clamped values.
+    """Return whether to report clamped values to users.
 
-    Splats that move or shrink may be large in a picture, so that one is enough; of others, a share of `MANY`.
+    A single splat that moves or shrinks may be large in a picture; other losses matter from a share of `MANY` on.
     """
     return visible > (0 if column == "center" or (column == "scale" and above) else MANY[column] * leaves)
 
 
 def clamps_of(tallies: Sequence[Tally], ranges: Sequence[CodeRange]) -> Clamps:
-    """Merge the tallies of all parts; in the order of the ranges."""
+    """Merge the tallies of all parts of a scene; the clamps are in the order of the ranges."""
     if not tallies:
         return {}, ()
     parts = np.stack(tallies)
     ends = parts[:, :, 4].min(axis=0), parts[:, :, 5].max(axis=0)
-    found = np.column_stack([parts[:, :, :4].sum(axis=0), *ends, parts[:, :, 6:].sum(axis=0)])
+    merged = np.column_stack([parts[:, :, :4].sum(axis=0), *ends, parts[:, :, 6:].sum(axis=0)])
     counts, clamps = dict[str, int](), list[Clamp]()
-    for each, row in zip(ranges, found.tolist(), strict=True):
+    for each, row in zip(ranges, merged.tolist(), strict=True):
         below, above, beyond, either, least, most, *visible = row
-        seen_below, seen_above, seen = map(int, visible)
         if either:
             counts[each.column] = int(either)
+        sides = [(False, below, each.low, least, False, visible[0]), (True, above, each.high, most, False, visible[1])]
         if each.low == -each.high:
-            if beyond:
-                farthest = max(-least, most)
-                clamps.append(Clamp(each.column, True, int(beyond), each.high, farthest, each.degree, True, seen))
-            continue
-        if below:
-            clamps.append(Clamp(each.column, False, int(below), each.low, least, each.degree, visible=seen_below))
-        if above:
-            clamps.append(Clamp(each.column, True, int(above), each.high, most, each.degree, visible=seen_above))
+            sides = [(True, beyond, each.high, max(-least, most), True, visible[2])]
+        for is_above, splats, end, farthest, both, seen in sides:
+            if splats:
+                clamps.append(Clamp(each.column, is_above, int(splats), end, farthest, each.degree, both, int(seen)))
     return counts, tuple(clamps)
 
 
 def clamps_in(
     splats: Splats, threads: int = 1, ranges: Sequence[CodeRange] = SPZ_RANGES, tree: LodTree | None = None
 ) -> Clamps:
-    """Find the values of splats, or of the nodes of a tree, that lie beyond ranges, in the order of the ranges."""
+    """Return the values of splats, or of the nodes of a tree, that lie beyond ranges, in the order of the ranges."""
 
     def counted(part: slice) -> Tally:
         return tally(splats.take(part), ranges, None if tree is None else tree.rows(part).is_leaf)
@@ -102,25 +100,25 @@ def clamps_in(
     return clamps_of(list(ordered_map(counted, blocks_of(len(splats)), threads)), ranges)
 
 
-#: Most splats of a sample, evenly spaced: losses are means. Chosen; takes about 0.2 s.
+#: Most splats of a sample, since losses are means. Chosen; takes about 0.2 s.
 SAMPLE = 1 << 15
 
-#: Directions in which colours are compared, the corners of a cube.
+#: Directions in which colours are compared: the corners of a cube.
 _DIRECTIONS = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, -1).T / np.sqrt(3)
 
-#: Squared change of colour that stands for a displacement by a splat's own size: a third of its opacity, since
+#: Squared change of colour that a displacement by the size of a splat counts as: a third of its opacity, since
 #: neighbours have similar colours. Chosen.
 _DISPLACED = 0.1
 
-#: Highest SH degree that pages of ExtSplats can have: Spark 2.2.0 has no texture for the second array of degree 3.
+#: Highest SH degree of pages of ExtSplats: Spark 2.2.0 has no texture for the second array of degree 3.
 MOST_PAGED_DEGREE = 2
 
 
 @dataclass(frozen=True)
 class LayoutLoss:
-    """Sums over splats, weighted by opacity and size: of weights, and of losses in each layout.
+    """Sums over splats: of weights, which are opacity times size, and of weighted losses in each layout.
 
-    A loss is the squared change of displayed colour, 0..1.
+    A loss is the squared change of the displayed colour, 0..1.
     """
 
     weight: float = 0.0
@@ -130,21 +128,18 @@ class LayoutLoss:
     @classmethod
     @np.errstate(over="ignore", invalid="ignore")  # of numbers near the end of float32
     def of(cls, splats: Splats) -> LayoutLoss:
-        """Return the sums over the valid splats whose losses are finite."""
+        """Return the sums over valid, visible splats whose losses are finite."""
         from . import layouts
 
-        splats = splats.take(
-            np.flatnonzero(
-                ~np.logical_or.reduce([splats.scale.max(axis=1, initial=0) <= 0, *splats.invalid().values()])
-            )
-        )
+        bad = np.logical_or.reduce([splats.scale.max(axis=1, initial=0) <= 0, *splats.invalid().values()])
+        splats = splats.take(np.flatnonzero(~bad))
         opacity = np.minimum(splats.opacity, 1).astype(np.float64)
         size = splats.scale.mean(axis=1, dtype=np.float64)
         seen = _colors(splats)
 
-        def losses(held: Splats) -> NDArray[np.float64]:
-            changes = np.square(_colors(held) - seen).mean(axis=(1, 2))
-            moved = np.linalg.norm(held.center.astype(np.float64) - splats.center, axis=1)
+        def losses(rounded: Splats) -> NDArray[np.float64]:
+            changes = np.square(_colors(rounded) - seen).mean(axis=(1, 2))
+            moved = np.linalg.norm(rounded.center.astype(np.float64) - splats.center, axis=1)
             return np.square(opacity) * (changes + _DISPLACED * np.square(np.minimum(1, moved / size)))
 
         ext = losses(layouts.unpack_ext(layouts.pack_ext(splats)))
@@ -160,17 +155,17 @@ class LayoutLoss:
 
     @property
     def better(self) -> str:
-        """Layout that loses less, "ext" or "packed"; "ext", which has the finer codes, where both lose the same."""
+        """Layout that loses less, "ext" or "packed"; "ext", which has the finer codes, if both lose the same."""
         return "packed" if self.packed < self.ext else "ext"
 
     def psnr(self, layout: str) -> float:
-        """Loss as a PSNR of the colours of splats, dB; infinite without any loss."""
+        """Return the loss in a layout as a PSNR of the colours of splats, dB; infinity without loss."""
         loss = getattr(self, layout)
         return float(10 * np.log10(self.weight / loss)) if loss else np.inf
 
 
 def sample_loss(splats: Splats, most: int = SAMPLE) -> LayoutLoss:
-    """Return the loss of an evenly spaced sample of splats, `most` at most."""
+    """Return the loss of an evenly spaced sample of at most `most` splats."""
     return LayoutLoss.of(splats.take(slice(0, None, max(1, -(-len(splats) // most)))))
 
 
@@ -187,9 +182,9 @@ class Losses:
     """Losses of a scene without a tree in a format.
 
     Attributes:
-        clamped: by the column of `Splats`, the number of splats with a value that the output cannot hold.
-        drops_sh: the output has no SH, and some splats do.
-        up_lost: the axis that points up, which the format cannot note; None where nothing is lost.
+        clamped: number of splats with clamped values, by column of `Splats`.
+        drops_sh: the splats have SH, and the output has not.
+        up_lost: the axis that points up, if it is known and the format cannot store it; else None.
     """
 
     clamped: dict[str, int]
@@ -198,7 +193,7 @@ class Losses:
 
 
 def settled_with_losses(scene: Scene, form: Format, options: WriteOptions, threads: int) -> tuple[WriteOptions, Losses]:
-    """Return the options with nothing left open, and the losses of a scene in a format; raises as `settled`."""
+    """Settle the options and find the losses of a scene in a format; raises the errors of the codec's `settled`."""
     codec = form.codec()
     settled: WriteOptions = codec.settled(scene, options)
     ranges = codec.held(settled, scene.splats.sh_degree) if hasattr(codec, "held") else ()
@@ -211,13 +206,13 @@ def settled_with_losses(scene: Scene, form: Format, options: WriteOptions, threa
 def after(through: str, file: Path, scene: Scene, threads: int = 1) -> Splats:
     """Encode and decode the splats of a scene in one of `formats.ROUND_TRIPS`.
 
-    Raises `FormatError`, which names the file, if splats are invalid or SPZ cannot hold them.
+    Raises `FormatError`, which names the file, if splats are invalid or SPZ cannot store them.
     """
     from . import layouts
 
     invalid = scene.splats.invalid()
-    if invalid:  # of a tree: those of plain files are left out
-        raise FormatError(f"{file}: {describe_invalid(invalid)}; no encoding holds such splats")
+    if invalid:  # nodes of a tree: invalid splats of plain files were left out
+        raise FormatError(f"{file}: {describe_invalid(invalid)}; no encoding can store such splats")
     try:
         if through == "packed":
             encoding = SplatEncoding(lod_opacity=scene.tree is not None)
@@ -226,7 +221,7 @@ def after(through: str, file: Path, scene: Scene, threads: int = 1) -> Splats:
         if through == "ext":
             return layouts.unpack_ext(layouts.pack_ext(scene.splats, threads=threads), threads=threads)
         codec = WRITABLE[f".{through}"].codec()
-        options = WriteOptions(compression_level=1)  # the bytes live for a moment only, so they need not be small
+        options = WriteOptions(compression_level=1)  # the bytes are discarded, so they need not be small
         data = b"".join(codec.encode(scene, options, threads=threads))
         return decode_file(codec, io.BytesIO(data), threads=threads).splats
     except FormatError as error:

@@ -1,4 +1,4 @@
-"""Number codings as pairs of encode and decode over whole arrays; each decode states its largest error.
+"""Number codings: pairs of functions that encode and decode arrays. Each decode states its largest error.
 
 Encoders take finite numbers and clamp them to the range of the code.
 """
@@ -17,13 +17,13 @@ from ..model.splats import FloatArray
 
 Bytes = NDArray[np.uint8]
 
-#: Bytes of logarithmic scales, as SPZ defines them: steps to a factor of e, and minus the smallest logarithm.
+#: Bytes of logarithmic scales in SPZ: steps per factor of e, and minus the smallest logarithm.
 SCALE_STEPS, SCALE_OFFSET = 16, 10
 
-#: Bytes of colours, as SPZ defines them: an SH DC coefficient is multiplied by this, around one half.
+#: Bytes of colours in SPZ: factor of SH DC coefficients, around one half.
 COLOR_GAIN = 0.15
 
-#: Fewest bits kept of the SH bytes of all degrees but the first, and of the first, as Niantic's library writes them.
+#: Fewest bits of the SH bytes of degrees above 1, and of degree 1, those of Niantic's library.
 LEAST_SH_BITS, LEAST_SH_BITS_1 = 4, 5
 
 #: All bits of a byte.
@@ -34,25 +34,22 @@ FIXED24_MAX = 2**23 - 1
 
 #: Smallest and largest value of each column of `Splats` that SPZ rounds to a code instead of clamping it.
 CLAMPS = {
-    "scale": (
-        float(np.exp(-0.5 / SCALE_STEPS - SCALE_OFFSET)),
-        float(np.exp(255.5 / SCALE_STEPS - SCALE_OFFSET)),
-    ),
+    "scale": (float(np.exp(-0.5 / SCALE_STEPS - SCALE_OFFSET)), float(np.exp(255.5 / SCALE_STEPS - SCALE_OFFSET))),
     "rgb": (0.5 - 128 * SH_C0 / (255 * COLOR_GAIN), 0.5 + 128 * SH_C0 / (255 * COLOR_GAIN)),
     "sh": (-128.5 / 128, 127.5 / 128),
 }
 
 _SQRT_HALF = np.float32(np.sqrt(0.5))
-#: Indices of the three components that remain, by the index of the one that is left out.
+#: Indices of the three other components of a quaternion, by the index of the largest.
 OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
-#: w of a unit quaternion below which codes beside those of x y z may mean a nearer rotation.
+#: Below this w of a unit quaternion, a neighbour of the codes of x y z may decode to a nearer rotation.
 _SMALL_W = 0.25
-#: The codes beside those of x y z, and themselves first.
+#: Steps from the codes of x y z to their neighbours; no step comes first.
 _STEPS = sorted(itertools.product((0, -1, 1), repeat=3), key=lambda step: sum(map(abs, step)))
 
-#: Written in place of an infinite logarithm or logit: in float32 its exponential and sigmoid are exactly those of
-#: infinity, and readers that refuse infinite numbers accept it.
+#: Replaces infinite logarithms and logits: its exponential and sigmoid in float32 are exactly those of infinity, and
+#: readers that refuse infinite numbers accept it.
 FAR = np.float32(110)
 
 #: Euler's constant, of the harmonic numbers.
@@ -72,7 +69,7 @@ def decode_log(values: FloatArray) -> FloatArray:
 
 
 def encode_log(values: FloatArray) -> FloatArray:
-    """Encode values, 0 or more, as natural logarithms, finite for 0 too; their exponentials are finite."""
+    """Encode values of 0 or more as natural logarithms, which are finite, as are their exponentials."""
     with np.errstate(divide="ignore"):
         return np.clip(np.log(values), -FAR, LARGEST_LOG)
 
@@ -84,7 +81,7 @@ def decode_logit(logit: FloatArray) -> FloatArray:
 
 
 def encode_logit(values: FloatArray) -> FloatArray:
-    """Encode 0..1 as logits, which are finite at both ends too."""
+    """Encode 0..1 as logits, which are finite for 0 and 1, too."""
     wide = values.astype(np.float64)
     with np.errstate(divide="ignore"):
         return np.clip(np.log(wide) - np.log1p(-wide), -FAR, FAR).astype(np.float32)
@@ -121,7 +118,7 @@ def decode_fixed24(codes: Bytes, fractional_bits: int) -> FloatArray:
 
 
 def encode_log_scale(scale: FloatArray) -> Bytes:
-    """Encode linear scales as a byte each; its range is e ** -10 to e ** 5.94."""
+    """Encode linear scales as bytes, for e ** -10 to e ** 5.94."""
     with np.errstate(divide="ignore"):
         return _to_byte((np.log(scale) + SCALE_OFFSET) * SCALE_STEPS)
 
@@ -143,10 +140,10 @@ def decode_unorm8(codes: Bytes) -> FloatArray:
 
 
 def encode_lod_opacity(lod_opacity: FloatArray) -> Bytes:
-    """Encode Spark's D, 0..5, as a byte: the lower half for 0..1, the upper half for 1..5.
+    """Encode Spark's D, 0..5, as bytes: the lower half for 0..1, the upper half for 1..5.
 
-    A tie rounds down, so that D = 1, half-way between two codes, stays an opacity (code 127, 0.996) and does not become
-    a merged splat's (code 128, D = 1.016).
+    Ties round down, so that D = 1, half-way between two codes, remains an opacity (code 127, 0.996) and does not become
+    that of a merged splat (code 128, D = 1.016).
     """
     half = np.where(lod_opacity <= 1, lod_opacity, (lod_opacity + 3) / 4) / 2
     return _to_byte(np.ceil(half * 255 - 0.5))
@@ -172,14 +169,14 @@ def decode_color(codes: Bytes) -> FloatArray:
 def encode_sh(sh: FloatArray, bits: int = LEAST_SH_BITS) -> Bytes:
     """Encode (N, K, 3) coefficients as bytes, rounded to multiples of 2 ** (8 - bits) codes; the range is -1..0.99.
 
-    `LEAST_SH_BITS` to 8 upper bits are kept; of degree 1 `LEAST_SH_BITS_1` at least. The codes of fewer bits are among
-    those of more.
+    The number of bits is `LEAST_SH_BITS` to 8; degree 1 has at least `LEAST_SH_BITS_1`. The codes of fewer bits are
+    among those of more.
     """
     bucket: np.float32 | FloatArray = np.float32(2 ** (8 - bits))
     if bits < LEAST_SH_BITS_1:
         first = np.arange(3 * sh.shape[1]) < 3 * COEFFICIENTS[1]
         bucket = np.where(first, np.float32(2 ** (8 - LEAST_SH_BITS_1)), bucket)
-    # Rows of all coefficients, in place: loops over the three channels of one, and new memory, take four times as long.
+    # In place, and in rows of all coefficients, which is four times as fast as loops over three channels.
     with np.errstate(over="ignore"):
         scaled = sh.reshape(len(sh), 3 * sh.shape[1]) * (np.float32(128) / bucket)
         np.rint(scaled, out=scaled)
@@ -189,15 +186,15 @@ def encode_sh(sh: FloatArray, bits: int = LEAST_SH_BITS) -> Bytes:
 
 
 def decode_sh(codes: Bytes) -> FloatArray:
-    """Decode bytes to coefficients. Largest error of 4 bits: 1 / 32 for degree 1, 1 / 16 above; half for each more."""
+    """Decode bytes to coefficients. Largest error: 2 ** -bits, with the bits of `encode_sh`."""
     return (codes.astype(np.float32) - 128) / 128
 
 
 def encode_quat_first_three(quat_xyzw: FloatArray) -> Bytes:
-    """Encode (N, 4) unit quaternions as (N, 3) bytes of x y z, of the one of q and -q whose w is not negative.
+    """Encode (N, 4) unit quaternions as (N, 3) bytes of x y z, of q or -q with w >= 0.
 
-    w follows from x y z as the root of a small difference where it is near 0. There, the codes beside the nearest are
-    tried as well, and those of the nearest rotation taken.
+    A small w is the root of a small difference, and sensitive to x y z. For those, neighbouring codes are compared, and
+    the codes of the nearest rotation are chosen.
     """
     sign = np.where(quat_xyzw[:, 3:] < 0, np.float32(-1), np.float32(1))
     codes = _to_byte(quat_xyzw[:, :3] * (sign * np.float32(127.5)) + np.float32(127.5))
@@ -220,7 +217,7 @@ def decode_quat_first_three(codes: Bytes) -> FloatArray:
 
 
 def quat_of_xyz(xyz: FloatArray) -> FloatArray:
-    """Return (N, 4) unit quaternions from (N, 3) x y z, whose w is not negative; too long ones are made shorter."""
+    """Return the (N, 4) unit quaternions with these (N, 3) x y z and w >= 0; x y z that are too long are shortened."""
     w = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", xyz, xyz)))
     return normalized_quat(np.concatenate([xyz, w[:, None]], axis=1))
 
@@ -228,8 +225,8 @@ def quat_of_xyz(xyz: FloatArray) -> FloatArray:
 def encode_quat_smallest_three(quat_xyzw: FloatArray) -> Bytes:
     """Encode (N, 4) unit quaternions as (N, 4) bytes, a little-endian uint32.
 
-    2 bits are the index of the largest component; of each other one, in order, there is a sign and 9 bits of magnitude
-    in units of sqrt(1 / 2) / 511.
+    The upper 2 bits are the index of the largest component. The other components follow in order, each with a sign and
+    9 bits of magnitude in units of sqrt(1 / 2) / 511.
     """
     largest = np.abs(quat_xyzw).argmax(axis=1)[:, None]
     others = np.take_along_axis(quat_xyzw, OTHERS[largest[:, 0]], axis=1)
@@ -253,10 +250,7 @@ def decode_quat_smallest_three(codes: Bytes) -> FloatArray:
 
 
 def quat_of_others(largest: NDArray[Any], a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """Return (N, 4) unit quaternions from components a b c in order; that at index `largest`, (N,), is missing.
-
-    The missing component is taken to be positive.
-    """
+    """Return (N, 4) unit quaternions with components a b c, in order, and a positive one at index `largest`, (N,)."""
     square = a * a + b * b + c * c
     rest = np.sqrt(np.maximum(1 - square, 0))
     over = 1 / np.sqrt(np.maximum(square, 1))  # rounding may make a b c longer than 1
@@ -269,7 +263,7 @@ def quat_of_others(largest: NDArray[Any], a: FloatArray, b: FloatArray, c: Float
 
 
 def encode_quat_bytes(quat: FloatArray) -> Bytes:
-    """Encode (N, 4) unit quaternions as a byte for each component c: 128 * c + 128."""
+    """Encode (N, 4) unit quaternions as (N, 4) bytes: 128 * c + 128 for each component c."""
     return _to_byte(quat * 128 + 128)
 
 
@@ -279,22 +273,22 @@ def decode_quat_bytes(codes: Bytes) -> FloatArray:
 
 
 def of_range(unit: FloatArray, low: Any, high: Any) -> FloatArray:
-    """Map 0..1 to low..high: low + unit * (high - low), as KSPLAT's and Spark's readers round it."""
+    """Map 0..1 to low..high as low + unit * (high - low), with the rounding of KSPLAT's and Spark's readers."""
     return low + unit * (high - low)
 
 
 def between(unit: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Map 0..1 to low..high: low * (1 - unit) + high * unit, as PlayCanvas's readers round it, exact at both ends."""
+    """Map 0..1 to low..high with the rounding of PlayCanvas's readers, which is exact at both ends."""
     return low * (1 - unit) + high * unit
 
 
 def range_table(low: Any, high: Any, codes: int) -> NDArray[np.float64]:
-    """Return (..., codes) values of the codes 0..codes - 1 in equal steps from low to high, (...,), in float64."""
+    """Return the (..., codes) float64 values of codes 0..codes - 1, in equal steps from low to high, (...,)."""
     return np.ascontiguousarray(np.linspace(low, high, codes, axis=-1))
 
 
 def _unorm(code: NDArray[np.uint32], low: int, bits: int) -> FloatArray:
-    """Return the `bits` bits of codes from bit `low` up as 0..1: all ones are 1."""
+    """Decode `bits` bits of words, from bit `low` up, to 0..1."""
     most = (1 << bits) - 1
     return (code >> np.uint32(low) & np.uint32(most)).astype(np.float32) / np.float32(most)
 
@@ -312,28 +306,25 @@ def decode_unorm_8888(code: NDArray[np.uint32]) -> FloatArray:
 def decode_quat_2_10_10_10(code: NDArray[np.uint32]) -> FloatArray:
     """Decode (N,) words to (N, 4) unit quaternions w x y z.
 
-    2 bits are the index of the largest component; each other one, in order, has 10 bits for -sqrt(1 / 2)..sqrt(1 / 2).
-    Largest error: 0.28 degrees of rotation.
+    The upper 2 bits are the index of the largest component. The other components follow in order, each with 10 bits for
+    -sqrt(1 / 2)..sqrt(1 / 2). Largest error: 0.28 degrees of rotation.
     """
     others = [(_unorm(code, low, 10) - np.float32(0.5)) * (2 * _SQRT_HALF) for low in (20, 10, 0)]
     return quat_of_others(code >> np.uint32(30), *others)
 
 
 def decode_centred_8(codes: Bytes) -> FloatArray:
-    """Decode bytes to -4..4: the middles of 256 steps, but for the first and the last, which are the ends.
-
-    Largest error: 1 / 32.
-    """
+    """Decode bytes to the middles of 256 steps of -4..4, except 0 and 255 to -4 and 4. Largest error: 1 / 32."""
     unit = (np.arange(256) + 0.5) / 256
     unit[0], unit[255] = 0, 1
     return ((unit - 0.5) * 8).astype(np.float32)[codes]
 
 
-#: Largest factor by which an opacity grows for an area that was lost, somewhat more than rounding can take. What loses
-#: more is larger than any code, such as a sky, and shrinks: a denser middle would not be more like it.
+#: Largest factor of an opacity that compensates for a lost area, somewhat more than rounding needs. A splat that loses
+#: more is larger than any code, such as a sky: a higher opacity would not make it more similar.
 MOST_GROWTH = 1.125
 
-#: Smallest factor, for splats smaller than any code: a pixel shows such a splat all the same.
+#: Smallest factor of an opacity, for splats smaller than any code, which stay visible in a pixel.
 LEAST_GROWTH = 1 / 16
 
 #: The smallest float32 above 1.
@@ -341,9 +332,9 @@ _ABOVE_1 = np.nextafter(np.float32(1), np.float32(2))
 
 
 def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
-    """Return (N,) sums of the products of two scales each, in proportion to the area that a splat shows on average.
+    """Return the (N,) sums of the products of two scales each, proportional to the mean projected area of a splat.
 
-    To each scale, a blur is added, as a pixel does: a splat far thinner than a pixel covers no less for it.
+    Each scale is convolved with a blur, as a pixel does: a splat far thinner than a pixel covers as much as a thin one.
     """
     planes = np.array(scale.T, np.float64, order="C")
     planes *= planes
@@ -354,17 +345,17 @@ def faces(scale: FloatArray, blur: float) -> NDArray[np.float64]:
 
 
 def compensated(opacity: FloatArray, scale: FloatArray, rounded: FloatArray | None, blur: float) -> FloatArray:
-    """Return (N,) linear opacities with which splats of rounded scales cover as much as before.
+    """Return (N,) linear opacities that compensate for the rounding of scales: splats cover as much as before.
 
-    A code of a scale is off by 3 % and more, so that a splat gets up to 7 % larger or smaller, and with it what it adds
-    to a picture (docs/decisions/08-rounding.md). A splat of opacity A up to 1 covers A times its area, and keeps an
-    opacity up to 1. A merged one of A above 1 covers H(A) times its area, where H are the harmonic numbers (see
-    `model/falloff.py`). It stays above 1, for that is another falloff. Where nothing is rounded, the opacity stays as
-    it is, bit for bit.
+    The code of a scale is off by 3 % or more, so that the area of a splat, and what it adds to a picture, changes by up
+    to 7 % (docs/decisions/08-rounding.md). A splat of opacity A up to 1 covers A times its area, and its opacity stays
+    at most 1. A merged splat of A above 1 covers H(A) times its area, where H are the harmonic numbers (see
+    `model/falloff.py`), and its opacity stays above 1, since the falloff differs. If the scales are not rounded, the
+    opacity stays the same to the last bit.
 
     Args:
-        rounded: (N, 3) scales as a file holds them; None for an SPZ file.
-        blur: see `faces`; a step of the positions is a good one, for it is far below a small splat of the scene.
+        rounded: (N, 3) scales in the file; None for an SPZ file.
+        blur: blur of `faces`, such as a step of positions, which is small for the splats of a scene.
     """
     area = faces(decode_log_scale(encode_log_scale(scale)) if rounded is None else rounded, blur)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Codings of Spark's memory layouts and of RAD: rotations as axis and angle, rounding, alpha, and codes of 8 bits.
+"""Codings of Spark's memory layouts and of RAD: rounding, rotations as axis and angle, alpha, and codes of 8 bits.
 
 The formulas are those of Spark 2.2.0's encoders in Rust, in float32 and in the same order of operations, because the
 last bit decides between two codes. Only functions that libraries round differently (arc cosine, sine, logarithm,
@@ -27,21 +27,21 @@ STEPS_10_10_12 = (1023, 4095)
 _PI = np.float32(np.pi)
 #: Sine of half the angle below which the axis is noise: Spark uses the x axis instead.
 _NO_ROTATION = np.float32(1e-6)
-#: Added before truncation, this rounds ties up; unlike 1 / 2 itself it does not round the float32 below 1 / 2 up to 1.
+#: Offset before truncation that rounds ties up. Unlike 1 / 2, it does not round the float32 below 1 / 2 up to 1.
 ALMOST_HALF = np.nextafter(np.float32(0.5), np.float32(0))
 
 
 def to_code(values: FloatArray, most: int) -> NDArray[np.uint32]:
-    """Round float32 numbers in units of codes to whole codes, clamped to 0..most, ties up."""
+    """Round float32 numbers to codes 0..most, ties up, and clamp others."""
     return (np.clip(values, 0, np.float32(most)) + ALMOST_HALF).astype(np.uint32)
 
 
 def encode_axis_angle(quat_xyzw: FloatArray, steps: tuple[int, int]) -> tuple[Words, Words, Words]:
     """Encode (N, 4) unit quaternions as (N,) u and v of the axis, 0..steps[0], and the angle, 0..steps[1].
 
-    The axis is that of the rotation by 0..pi. It is projected onto the octahedron |x| + |y| + |z| = 1, whose lower half
-    is folded outward into the corners of the square that the upper half covers in x and y: u and v are x and y of the
-    result, -1..1. A rotation by 0 gets the x axis.
+    The axis is that of the rotation by 0..pi, or the x axis for a rotation by 0. It is projected onto the octahedron
+    |x| + |y| + |z| = 1, whose upper half covers a square in x and y, and whose lower half is folded outward into the
+    corners of that square: u and v are x and y of the result, -1..1.
     """
     axis_steps, angle_steps = steps
     x, y, z, w = np.ascontiguousarray(quat_xyzw.T)
@@ -70,10 +70,10 @@ def encode_axis_angle(quat_xyzw: FloatArray, steps: tuple[int, int]) -> tuple[Wo
 def decode_axis_angle(u: NDArray[Any], v: NDArray[Any], angle: NDArray[Any], steps: tuple[int, int]) -> FloatArray:
     """Decode three codes, (N,) each, to (N, 4) unit quaternions x y z w with w >= 0.
 
-    Largest error: 1.94 degrees of rotation for `STEPS_8_8_8`, 0.476 for `STEPS_10_10_12`. x and y of the axis lie
-    within 1 / steps[0], which is sqrt(6) / steps[0] along a face of the octahedron and sqrt(18) / steps[0] radians
-    seen from the middle, sqrt(1 / 3) away; a turn by pi has twice that. The angle lies within pi / 2 / steps[1], and
-    that error is about another axis, at a right angle.
+    Largest error: 1.94 degrees of rotation for `STEPS_8_8_8`, 0.476 for `STEPS_10_10_12`. Errors of x and y of the axis
+    are at most 1 / steps[0], which is sqrt(6) / steps[0] along a face of the octahedron and sqrt(18) / steps[0] radians
+    seen from the middle, sqrt(1 / 3) away, and twice that for a turn by pi. The error of the angle, at most
+    pi / 2 / steps[1], is about another axis, at a right angle.
     """
     axis_steps, angle_steps = steps
     x, y = u * np.float64(2 / axis_steps) - 1, v * np.float64(2 / axis_steps) - 1
@@ -111,13 +111,13 @@ LARGEST_END = float(quantize.LARGEST) / 2
 
 @dataclass(frozen=True)
 class SplatEncoding:
-    """The ranges of the codes: Spark's `splatEncoding`, with its defaults.
+    """Ranges of codes, with the names and defaults of Spark's `splatEncoding`.
 
     Attributes:
-        rgb_min, rgb_max: colours of code 0 and 255.
-        ln_scale_min, ln_scale_max: logarithms of the scales of code 1 and 255.
+        rgb_min, rgb_max: colours of codes 0 and 255.
+        ln_scale_min, ln_scale_max: logarithms of the scales of codes 1 and 255.
         sh1_max, sh2_max, sh3_max: largest SH coefficient of each degree.
-        lod_opacity: alpha is 0..2, where 1..2 stands for D = 1..5, as Spark sets it for an LoD tree.
+        lod_opacity: alpha is 0..2, where 1..2 stands for D = 1..5, as in Spark for an LoD tree.
     """
 
     rgb_min: float = 0
@@ -145,39 +145,39 @@ class SplatEncoding:
 
     @property
     def alpha_max(self) -> int:
-        """The alpha of code 255."""
+        """Alpha of code 255."""
         return 2 if self.lod_opacity else 1
 
     def sh_max(self, degree: int) -> np.float32:
-        """Return the largest coefficient of a degree."""
+        """Return the largest SH coefficient of a degree."""
         return np.float32((self.sh1_max, self.sh2_max, self.sh3_max)[degree - 1])
 
 
-#: Encoding of Spark.
+#: Ranges that Spark uses unless a file sets others.
 DEFAULT = SplatEncoding()
 
 
 @np.errstate(over="ignore")
 def encode_linear(values: FloatArray, low: float, high: float) -> Words:
-    """Encode numbers as codes, low..high to 0..255; they are clamped to the range."""
+    """Encode low..high as codes 0..255; other numbers are clamped."""
     first, width = np.float32(low), np.float32(high) - np.float32(low)
     return to_code((values - first) / width * np.float32(255), 255)
 
 
 def decode_linear(codes: NDArray[np.uint8], low: float, high: float) -> FloatArray:
-    """Decode codes to low..high. Largest error: (high - low) / 510."""
+    """Decode codes 0..255 to low..high. Largest error: (high - low) / 510."""
     return quantize.of_range(codes.astype(np.float32) / np.float32(255), np.float32(low), np.float32(high))
 
 
 def nearest_log(values: FloatArray) -> FloatArray:
-    """Return natural logarithms, rounded once."""
+    """Compute natural logarithms in float64, rounded to float32."""
     found: FloatArray = np.log(values.astype(np.float64)).astype(np.float32)
     return found
 
 
-@np.errstate(over="ignore")  # a stranger's range may be any
+@np.errstate(over="ignore")  # files may have any range
 def nearest_exp(values: FloatArray) -> FloatArray:
-    """Return exponentials, rounded once."""
+    """Compute exponentials in float64, rounded to float32."""
     found: FloatArray = np.exp(values.astype(np.float64)).astype(np.float32)
     return found
 
@@ -193,7 +193,7 @@ def encode_log_scale(
     """Encode linear scales: 0 for scales below e ** -30, 1..255 for logarithms from low to high.
 
     Args:
-        log: natural logarithm: `spark_nodes.log`, that of Spark's worker, or one that is rounded once.
+        log: natural logarithm, such as `spark_nodes.log`.
         least: smallest scale that is not encoded as 0.
     """
     first = np.float32(low)
@@ -205,9 +205,9 @@ def encode_log_scale(
     return codes
 
 
-@np.errstate(over="ignore")  # a stranger's range may be any
+@np.errstate(over="ignore")  # files may have any range
 def log_scale_table(low: float, high: float, *, exp: Callable[[FloatArray], FloatArray] = nearest_exp) -> FloatArray:
-    """Return (256,) linear scales of the codes. Largest error: a factor of e ** ((high - low) / 508); none for 0."""
+    """Return the (256,) linear scales of codes. Largest error: a factor of e ** ((high - low) / 508); none for 0."""
     first = np.float32(low)
     logs = first + np.arange(-1, 255, dtype=np.float32) * ((np.float32(high) - first) / np.float32(254))
     table = exp(logs)

@@ -28,16 +28,15 @@ ROW = np.dtype(
 )
 assert ROW.itemsize == 32
 
-#: What is held without being clamped: colours that round to a code, and no SH.
+#: Values that are stored without clamping: colours that round to a code, and no SH.
 HELD = (CodeRange("rgb", -0.5 / 255, 255.5 / 255), CodeRange("sh", 0, 0))
 
 
 def open_content(source: OpenFile) -> Reader:
     """Open a .splat file. The format has no header: any file whose size is a multiple of 32 is accepted."""
-    size = source.size
+    size, count = source.size, source.size // ROW.itemsize
     if size % ROW.itemsize:
         raise TruncatedError(f"cut short, or not .splat: its {size:,} bytes are not a multiple of {ROW.itemsize}")
-    count = size // ROW.itemsize
 
     def fill(target: RowBuffer, threads: int, progress: Progress) -> None:
         def decode_block(block: Rows) -> int:
@@ -58,32 +57,32 @@ def open_content(source: OpenFile) -> Reader:
 
 
 def importance_order(splats: Splats) -> NDArray[np.intp]:
-    """Return (N,) indices by descending product of scales and opacity, as antimatter15's converter sorts."""
+    """Return (N,) indices in the order of antimatter15's converter: by descending product of scales and opacity."""
     importance = splats.scale.astype(np.float64).prod(axis=1) * splats.opacity
     return np.argsort(-importance, kind="stable")
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """Return the options: .splat has no choices; raises `FormatError` for a tree, which it cannot hold."""
+    """Return the options unchanged, since .splat has none; raises `FormatError` for a tree, which it cannot store."""
     if scene.tree is not None:
         raise FormatError("SPLAT holds no Level-of-Detail tree")
     return options
 
 
 def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
-    """Return the values that .splat holds without clamping them."""
+    """Return the ranges of values that .splat stores without clamping."""
     return HELD
 
 
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """Return the bytes of a .splat file, piece by piece, in order of importance and without SH."""
+    """Yield the bytes of a .splat file, with splats in order of importance and without SH."""
     settled(scene, options)
-    order = importance_order(scene.splats)
+    order, plain = importance_order(scene.splats), scene.splats.with_max_sh(0)
 
     def rows(part: slice) -> bytes:
-        splats = scene.splats.with_max_sh(0).take(order[part])
+        splats = plain.take(order[part])
         out = np.empty(len(splats), ROW)
         out["center"] = splats.center
         out["scale"] = splats.scale

@@ -1,7 +1,7 @@
-"""`Statistics`: counts over all splats of a file, which settle its options before the first splat is written.
+"""`Statistics` of all splats of a file, from which the writer chooses options before it writes the first splat.
 
-Parts are counted on their own and merged in any order with the same result, which stays small: the settings of a file
-that does not fit into memory follow from the statistics of its parts. `Distribution` also serves `inspect`.
+Statistics are small, and those of parts of a file can be merged in any order with the same result, so that a file need
+not fit into memory. `Distribution` also serves `inspect`.
 """
 
 from __future__ import annotations
@@ -23,19 +23,20 @@ from ..system.threads import blocks_of, ordered_map
 from . import quantize
 from .quantize import ALL_BITS
 
-#: A bin holds the float32 values with the same upper 16 bits: sign, exponent and 7 bits of the mantissa. Its ends
+#: A bin counts the float32 values with the same upper 16 bits: sign, exponent and 7 bits of the mantissa. Its ends
 #: are at most 0.8 % apart.
 _SHIFT, _BINS = 16, 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """Histogram of float32 values with relative bins, which can be merged.
+    """Histogram of float32 values with bins of equal relative width.
 
     Attributes:
-        bins: (B,) int64 those that hold values, ascending with them: 32768 begins at 0, those below are negative.
-        counts: (B,) int64 values in each.
-        least, most: (B,) float32 smallest and largest value in each.
+        bins: (B,) int64 numbers of the bins with values, in the order of the values: bin 32768 begins at 0, and lower
+            bins are negative.
+        counts: (B,) int64 number of values in each bin.
+        least, most: (B,) float32 smallest and largest value in each bin.
     """
 
     bins: NDArray[np.int64]
@@ -45,7 +46,7 @@ class Distribution:
 
     @classmethod
     def of(cls, values: FloatArray) -> Distribution:
-        """Count all values of a float32 array of any shape; NaN is in the last bin."""
+        """Count the values of a float32 array of any shape; NaN goes to the last bin."""
         ordered = np.sort(values, axis=None) + np.float32(0)  # -0 becomes 0
         ordered[np.isnan(ordered)] = np.nan  # without a sign
         bits = ordered.view(np.uint32) >> np.uint32(_SHIFT)
@@ -85,7 +86,7 @@ class Distribution:
         return float(self.most.max(initial=0))
 
     def magnitudes(self, sign: int) -> NDArray[np.int64]:
-        """Return (32768,) counts of the values of a sign, 1 or -1, by ascending magnitude (`UPPER`); 0 is positive."""
+        """Return (32768,) counts of values of one sign, 1 or -1, by ascending magnitude (`UPPER`); 0 is positive."""
         counts = np.zeros(_BINS, np.int64)
         counts[self.bins] = self.counts
         return counts[_BINS // 2 :] if sign > 0 else counts[_BINS // 2 - 1 :: -1]
@@ -93,8 +94,8 @@ class Distribution:
     def quantile(self, share: float) -> float:
         """Return a quantile, linearly interpolated as numpy does, with a relative error of at most 0.8 %.
 
-        It is exact where the values on either side of it lie in two bins, and otherwise lies in their bin. Infinity
-        where a value is not a number; 0 of no values.
+        It is exact if the two neighbouring values lie in different bins. Returns infinity if a value is NaN, and 0 if
+        there are no values.
         """
         if not len(self.counts):
             return 0.0
@@ -117,32 +118,39 @@ class Distribution:
 _COLUMNS = ("counts", "least", "most")
 
 
-#: Ends of the bins of magnitudes, 32,768 from 0 up. The last ones are of infinity and of what is not a number.
+#: Lower and upper ends of the 32,768 bins of magnitudes, from 0 up. The last bins are those of infinity and NaN.
 _BITS = np.arange(_BINS // 2 + 1, dtype=np.uint32) << np.uint32(_SHIFT)
 with np.errstate(invalid="ignore"):
     LOWER, UPPER = (_BITS.view(np.float32)[ends].astype(np.float64) for ends in (slice(-1), slice(1, None)))
 
 
 def tops(counts: NDArray[np.int64], total: int, most: float, beyond: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the magnitudes above which lie at most these shares of `total` values; `most` is the largest magnitude."""
-    above = np.cumsum(counts[::-1])[::-1]  # of each bin and all larger ones
+    """Return the smallest magnitudes above which at most given shares of values lie.
+
+    Args:
+        counts: (32768,) counts by magnitude, see `Distribution.magnitudes`.
+        total: number of all values, of which `beyond` are shares.
+        most: largest magnitude.
+        beyond: (n,) shares.
+    """
+    above = np.cumsum(counts[::-1])[::-1]  # values in each bin and all larger ones
     first = [int(np.count_nonzero(above > share * total)) for share in beyond]
     return np.minimum([UPPER[each - 1] if each else 0.0 for each in first], most)
 
 
-#: Largest root mean square, over splats and directions, of what dropping bits changes of a splat's colour: with
-#: it, SH alone cost what 58 dB and more are, see docs/decisions/08-rounding.md.
+#: Largest root mean square change of a colour, over splats and directions, by dropped bits of SH. It costs what a PSNR
+#: of 58 dB or more means, see docs/decisions/08-rounding.md.
 LARGEST_ERROR = 0.009
 
-#: Splats whose SH are counted at a time: they and their codes stay in the processor's cache.
+#: Splats whose SH are counted at a time: they and their codes fit into the processor's cache.
 _SH_ROWS = 1 << 13
 
 
 def sh_code_counts(sh: FloatArray) -> tuple[NDArray[np.int64], int]:
-    """Count (N, K, 3) SH coefficients as bytes of SPZ.
+    """Count (N, K, 3) SH coefficients by their bytes in SPZ.
 
     Returns:
-        (degrees, 256) int64 coefficients of each degree by their code, and how many lie between two codes.
+        (degrees, 256) int64 numbers of coefficients by degree and code, and the number of those between two codes.
     """
     counts, between = np.zeros((MAX_SH_DEGREE, 256), np.int64), 0
     for start in range(0, len(sh), _SH_ROWS):
@@ -156,9 +164,9 @@ def sh_code_counts(sh: FloatArray) -> tuple[NDArray[np.int64], int]:
 
 
 def sh_error(counts: NDArray[np.int64], bits: int) -> float:
-    """Return the root mean square change of a colour, over splats and directions, if this many bits are kept.
+    """Return the root mean square change of a colour, over splats and directions, if SH keep this many bits.
 
-    The mean square of a basis function over all directions is 1 / (4 * pi). The counts are those of `sh_code_counts`.
+    The mean square of a basis function over all directions is 1 / (4 * pi). `counts` are those of `sh_code_counts`.
     """
     codes = np.broadcast_to(np.arange(256, dtype=np.uint8)[:, None, None], (256, COEFFICIENTS[MAX_SH_DEGREE], 3))
     whole = quantize.decode_sh(np.ascontiguousarray(codes))
@@ -171,35 +179,34 @@ def sh_error(counts: NDArray[np.int64], bits: int) -> float:
 
 
 def enough(counts: NDArray[np.int64], between: int) -> int:
-    """Return the fewest bits of the SH of full detail, see `sh_code_counts`, that keep to `LARGEST_ERROR`.
+    """Return the fewest bits of the SH of leaves, counted by `sh_code_counts`, whose error is within `LARGEST_ERROR`.
 
-    Where all coefficients are codes, as those from an SPZ file, none may change: they stay the same however often they
-    are written.
+    If all coefficients are codes, such as those from an SPZ file, none may change, however often they are rewritten.
     """
     most = LARGEST_ERROR if between else 0.0
     every = range(quantize.LEAST_SH_BITS, ALL_BITS)
     return next((bits for bits in every if sh_error(counts, bits) <= most), ALL_BITS)
 
 
-#: A step of the positions is at most a 16th of the standard deviation of a small splat, so that rounding shifts it by
-#: at most a 32nd; small are the splats at this quantile of the largest scales. See docs/decisions/05-spz.md.
+#: A step of positions is at most a 16th of the standard deviation of a small splat, so that rounding moves it by at
+#: most a 32nd. The largest scale of a small splat is that of this quantile. See docs/decisions/05-spz.md.
 STEPS_A_SPLAT, SMALL_QUANTILE = 16, 0.01
 
-#: Fractional bits of the smallest float32: with these, nothing is rounded.
+#: Fractional bits of the smallest float32, with which no position is rounded.
 EXACT_BITS = 149
 
 
 def fine_bits(leaf_scale: Distribution) -> int:
-    """Return the fractional bits with which a step is far below the smallest splats of full detail (`STEPS_A_SPLAT`).
+    """Return the fractional bits that make a step of positions small for a small leaf, see `STEPS_A_SPLAT`.
 
-    A step is a power of two, so the binade of the small splats is all that matters; without a size, `EXACT_BITS`.
+    Returns `EXACT_BITS` if the size of small leaves is 0 or not finite.
     """
     small = leaf_scale.quantile(SMALL_QUANTILE)
     return math.ceil(math.log2(STEPS_A_SPLAT / small)) if 0 < small < math.inf else EXACT_BITS
 
 
-#: What can be counted. Of leaves, or of splats without a tree: the largest scale, how many times as long as wide they
-#: are, and the bytes of SH; of all: the largest coordinate, and three columns.
+#: Names of statistics. Of leaves, or of splats without a tree: the largest scale, the length over the width, and the
+#: bytes of SH. Of all splats: the largest coordinate, and three columns.
 ALL = frozenset(("reach", "leaf_scale", "leaf_length", "leaf_sh", "rgb", "scale", "sh"))
 
 #: Splats that a thread counts at a time.
@@ -208,13 +215,13 @@ _BLOCK = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class Statistics:
-    """Statistics of splats; fields that were not requested are missing.
+    """Statistics of splats; those that were not requested are missing.
 
     Attributes:
         tree: the splats are nodes of a tree.
-        reach: the largest magnitude of a coordinate.
+        reach: largest magnitude of a coordinate.
         values: distributions of "leaf_scale", "leaf_length", "rgb", "scale", "sh1", "sh2" and "sh3", see `ALL`.
-        leaf_sh, sh_between: `sh_code_counts` of leaves, or of splats where there is no tree; None without SH.
+        leaf_sh, sh_between: `sh_code_counts` of leaves, or of splats without a tree; None without SH.
     """
 
     count: int
@@ -232,8 +239,8 @@ class Statistics:
         """Count N splats or nodes.
 
         Args:
-            leaf: (N,) which nodes are leaves; None for splats that are no nodes.
-            needed: what to count, of `ALL`.
+            leaf: (N,) mask of the nodes that are leaves; None for splats without a tree.
+            needed: names of statistics, of `ALL`.
         """
 
         def count(part: slice) -> Statistics:
@@ -280,7 +287,7 @@ class Statistics:
         )
 
     def array(self) -> NDArray[np.uint8]:
-        """Return the bytes of these statistics, tens of KB, for `from_array`."""
+        """Encode these statistics for `from_array`, as tens of KB."""
         columns = {name: value for name, value in vars(self).items() if name != "values" and value is not None}
         columns |= {f"{name}.{key}": value for name, part in self.values.items() for key, value in vars(part).items()}
         file = io.BytesIO()
@@ -289,7 +296,7 @@ class Statistics:
 
     @classmethod
     def from_array(cls, array: NDArray[np.uint8]) -> Statistics:
-        """Return the statistics of `array`."""
+        """Decode the result of `array`."""
         facts: dict[str, Any] = {}
         parts: dict[str, dict[str, Any]] = {}
         with np.load(io.BytesIO(array.tobytes()), allow_pickle=False) as file:
@@ -301,7 +308,7 @@ class Statistics:
 
 
 def lengths(scale: FloatArray) -> FloatArray:
-    """Return (N,) the largest scale of splats by the middle one; 1 for those of no width."""
+    """Return the (N,) ratios of the largest and the middle scale of splats; 1 if the middle scale is 0."""
     x, y, z = scale.T
     largest = np.maximum(np.maximum(x, y), z)
     middle = np.maximum(np.minimum(x, y), np.minimum(np.maximum(x, y), z))
