@@ -58,16 +58,18 @@ FORMATS = (
     PathFormat(
         "nerfstudio",
         "nerfstudio's camera path",
-        "trainers",
+        "other_programs",
         Axes.OPENGL_C2W,
         world="nerfstudio's viewer works in a world that it centred, turned and scaled, as are the splats that it"
         " exports; splats trained elsewhere need --world-transform.",
     ),
-    PathFormat("transforms", "transforms.json", "trainers", Axes.OPENGL_C2W, names=(("transforms.json",),)),
-    PathFormat("inria", "Inria's cameras.json", "trainers", Axes.OPENCV_C2W, names=(("cameras.json",),)),
-    PathFormat("supersplat", "SuperSplat", "supersplat", None, looking=True, world=PLAYCANVAS),
-    PathFormat("camera-track", "splat-transform's camera track", "supersplat", None, looking=True, world=PLAYCANVAS),
-    PathFormat("open3d", "Open3D's camera trajectory", "trainers", Axes.OPENCV_W2C),
+    PathFormat("transforms", "transforms.json", "other_programs", Axes.OPENGL_C2W, names=(("transforms.json",),)),
+    PathFormat("inria", "Inria's cameras.json", "other_programs", Axes.OPENCV_C2W, names=(("cameras.json",),)),
+    PathFormat("supersplat", "SuperSplat", "other_programs", None, looking=True, world=PLAYCANVAS),
+    PathFormat(
+        "camera-track", "splat-transform's camera track", "other_programs", None, looking=True, world=PLAYCANVAS
+    ),
+    PathFormat("open3d", "Open3D's camera trajectory", "other_programs", Axes.OPENCV_W2C),
     PathFormat(
         "colmap",
         "COLMAP",
@@ -75,7 +77,7 @@ FORMATS = (
         Axes.OPENCV_W2C,
         names=(("images.bin", "cameras.bin"), ("images.txt", "cameras.txt")),
     ),
-    PathFormat("tum", "TUM trajectory", "trainers", Axes.OPENCV_C2W),
+    PathFormat("tum", "TUM trajectory", "other_programs", Axes.OPENCV_C2W),
 )
 
 #: Sets of files that are searched for in a folder, and beside a file of one of them: COLMAP's first.

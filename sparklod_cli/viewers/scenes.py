@@ -276,13 +276,14 @@ class CutFinder:
 
     def __init__(self, scenes: Scenes, settings: LodSettings | None, *, remembers: bool = False) -> None:
         self.scenes, self.settings = scenes, settings
-        cuts = settings is not None and scenes.with_cuts
-        self.viewer = scenes.viewer(settings, remembers=remembers) if settings is not None and cuts else None
+        self.viewer: Viewer | None = None
         self._continuous: ContinuousCuts | None = None
-        if self.viewer is not None and settings is not None and settings.continuous is not None:
-            from .continuous import ContinuousCuts
+        if settings is not None and scenes.with_cuts:
+            self.viewer = scenes.viewer(settings, remembers=remembers)
+            if settings.continuous is not None:
+                from .continuous import ContinuousCuts
 
-            self._continuous = ContinuousCuts(self.viewer)
+                self._continuous = ContinuousCuts(self.viewer)
 
     def with_budget(self, budget: int) -> CutFinder:
         """Return a finder with another budget and its own viewer, since viewers start from their last cut."""
@@ -300,17 +301,13 @@ class CutFinder:
 
     def cut(self, camera: Camera) -> Cut:
         """Return the cut of all instances, see `Scenes.cut_of`; a continuous one if the settings say so."""
-        if self.viewer is None or self.settings is None:
+        settings = self.settings
+        if self.viewer is None or settings is None:
             return self.scenes.full()
-        if self._continuous is None or self.settings.continuous is None:
+        if self._continuous is None or settings.continuous is None:
             return self.scenes.cut_of(self.find(camera))
-        blended = self._continuous.cut(
-            camera,
-            budget=self.settings.budget,
-            smallest=self.settings.limit(camera.fov_y, camera.height),
-            width=self.settings.continuous,
-        )
-        return self.scenes.cut_of(blended)
+        limit, width = settings.limit(camera.fov_y, camera.height), settings.continuous
+        return self.scenes.cut_of(self._continuous.cut(camera, budget=settings.budget, smallest=limit, width=width))
 
     def candidates(self) -> Cut:
         """Return all splats that the cut of any camera may have: whole trees, all detail levels, all tiles."""
