@@ -42,8 +42,8 @@ ANNOUNCED = re.compile(r"#\s*Number of (?:images|cameras):\s*(\d{1,18})\b", re.A
 NAMES = next(form.names for form in FORMATS if form.name == "colmap")
 
 
-#: Camera models, in the order of their numbers in cameras.bin: numbers of focal lengths, 0 where a pinhole camera
-#: cannot replace the model, and of parameters after the principal point, all of the distortion.
+#: Camera models, in the order of their numbers in cameras.bin: number of focal lengths, 0 if a pinhole camera cannot
+#: replace the model, and of parameters after the principal point, which are all of the distortion.
 MODELS = {
     "SIMPLE_PINHOLE": (1, 0),
     "PINHOLE": (2, 0),
@@ -98,7 +98,7 @@ def _is_comment(line: str) -> bool:
 
 
 def parse_colmap(files: Files, settings: Settings) -> Parsed:
-    """Return its images, sorted by name: COLMAP writes them in any order."""
+    """Parse images, which COLMAP writes in any order, sorted by name."""
     cameras = None
     if "cameras.bin" in files.contents:
         cameras = _binary_cameras(files.contents["cameras.bin"])
@@ -123,7 +123,7 @@ def parse_colmap(files: Files, settings: Settings) -> Parsed:
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a key that sorts 9 before 10 in names."""
+    """Return a key that sorts names by the numbers in them, 9 before 10."""
     parts = [(part.lstrip("0") if index % 2 else part) for index, part in enumerate(re.split(r"([0-9]+)", name))]
     return [(len(part) if index % 2 else 0, part) for index, part in enumerate(parts)]
 
@@ -133,10 +133,7 @@ Image = tuple[CameraJson, int, list[float], list[float]]
 
 
 def _text_images(data: bytes) -> list[Image]:
-    """Return the images of images.txt, with a line of points after each, after some, or after none.
-
-    The line after an image is read, since some programs leave out the lines of points, or the empty ones among them.
-    """
+    """Parse images.txt; a line of points may follow each image, as some programs leave out all, or the empty, ones."""
     lines, announced = _lines(data, "images.txt")
     images: list[Image] = []
     points_may_follow = False
@@ -162,7 +159,7 @@ def _image(values: Sequence[Any], place: str) -> Image:
 
 
 def _is_points(line: str) -> bool:
-    """Return whether a line has the points of an image: x, y and a whole number each. Its first four are judged.
+    """Return whether a line has the points of an image, x, y and a whole number each; only four points are checked.
 
     A line of an image with a name of one number has 10 words, which is no multiple of 3. One with a name such as
     "2024 10 3" begins with a rotation.

@@ -83,7 +83,7 @@ def parse_transforms(files: Files, settings: Settings) -> Parsed:
 
 
 def _lens(item: CameraJson, root: CameraJson) -> Intrinsics:
-    """Return the lens of a frame: each value is that of the frame, or else of the whole file."""
+    """Return the lens of a frame; values that the frame lacks are those of the whole file."""
 
     def number(key: str) -> float | None:
         return (item if item.has(key) else root).optional(key, CameraJson.number)
@@ -132,7 +132,7 @@ COLUMNS = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 def recognises_open3d(files: Files) -> bool:
-    """Return whether the file is JSON of that class, or begins with three whole numbers and a row of four."""
+    """Return whether the file is JSON of `CLASS`, or begins with three whole numbers and a row of four numbers."""
     if files.json is not None:
         return files.json.has("class_name") and files.json.value["class_name"] == CLASS
     rows = [line.split() for line in (files.text or "").split("\n", 2)[:2]]
@@ -174,7 +174,7 @@ def _frames_of_log(lines: list[str]) -> list[Frame]:
 
 
 def recognises_tum(files: Files) -> bool:
-    """Return whether its first line that is not a comment has eight numbers."""
+    """Return whether the first line that is not a comment has eight numbers."""
     words = next(_rows((files.text or "").splitlines()), (0, []))[1]
     try:
         return len([float(word) for word in words]) == len(COLUMNS)

@@ -1,4 +1,4 @@
-"""The instances file: JSON that names splat files and says where they stand."""
+"""The instances file: JSON with splat files and their positions in the world."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from ..model.transforms import LARGEST, scale_of
 from ..system.errors import SparklodError
 from ..system.untrusted import Json, Origin, quoted_value, well_formed
 
-#: What an instance may say.
+#: Keys of an instance.
 PARTS = ("translation", "rotation", "scale")
 KEYS = ("file", "name", "matrix", *PARTS, "lod_scale", "foveation")
 
-#: The kinds of foveation: their keys, and the fields that these fill.
+#: Kinds of foveation: fields by their keys.
 FRUSTUM = {"outside_foveate": "outside", "behind_foveate": "behind"}
 CONES = {"cone_fov0": "fov0", "cone_fov": "fov", "cone_foveate": "foveate", "behind_foveate": "behind"}
 
-#: How far the axes of a matrix may be from right angles and one length.
+#: Largest deviation of the axes of a matrix from right angles and one length, see `scale_of`.
 SKEW = 1e-3
 
 #: Degrees of a whole cone.
@@ -34,22 +34,22 @@ WIDEST = 180
 
 
 class InstancesFileError(SparklodError):
-    """An instances file cannot be understood."""
+    """An instances file is invalid."""
 
 
 def read_instances(path: Path | str) -> list[Instance]:
     """Read the instances of a file; paths in it are relative to its folder.
 
     Raises:
-        InstancesFileError: it says something that is not an instance; names the file and the instance.
-        FormatError: it cannot be read.
+        InstancesFileError: the file, or an instance in it, is invalid; the message names both.
+        FormatError: the file cannot be read.
     """
     path = Path(path)
 
     def error(problem: str) -> InstancesFileError:
         return InstancesFileError(f"{path}: {problem}")
 
-    root = Json.parse(read_text(path), Origin("", error), keep_surrogates=True)  # files may be called so
+    root = Json.parse(read_text(path), Origin("", error), keep_surrogates=True)  # in names of files
     listed = root.value.get("instances") if isinstance(root.value, dict) else None
     if not isinstance(listed, list) or not listed:
         raise error('it has no list of instances: {"instances": [{"file": ...}, ...]}')

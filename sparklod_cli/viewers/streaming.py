@@ -7,7 +7,7 @@ import itertools
 import math
 from bisect import bisect_right
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from heapq import heappop, heappush
 
 import numpy as np
@@ -22,11 +22,11 @@ class Chunks:
 
     Args:
         requests: for each scene and chunk, bytes of the answer to its first request, and of the answers to the others,
-            which are asked for together.
-        headers: for each scene the sizes of the answers that a viewer waits for, one after the other, before it can ask
-            for a chunk.
-        rooted: the first chunk of each scene holds its root, and is always wanted; False for Streamed SOG, whose chunk
-            files are drawn each for itself.
+            which are sent together.
+        headers: for each scene, bytes of the answers that a viewer receives, one after the other, before it can request
+            a chunk.
+        rooted: the first chunk of each scene holds its root, and is always wanted; False for Streamed SOG, each of
+            whose chunk files is drawn by itself.
         connections: largest number of concurrent requests; None for any number.
 
     Attributes:
@@ -49,30 +49,25 @@ class Chunks:
         self.requests = [parts or (0,) for of_scene in requests for parts in of_scene]
         self.sizes = list(map(sum, self.requests))
         self.headers = [tuple(each) for each in headers or [()] * len(requests)]
-        if len(self.headers) != len(requests):
-            raise ValueError(f"there are {len(self.headers)} headers of {len(requests)} trees")
-        for tree, of_tree in enumerate(requests):
-            if not len(of_tree) or min(map(min, filter(None, of_tree)), default=0) < 0:
-                raise ValueError(f"the chunks of tree {tree} must be a list of sizes, each 0 or more")
         self.firsts = [0, *itertools.accumulate(map(len, requests))][:-1]
         self.roots = self.firsts if rooted else []
 
     def shows(self, resident: NDArray[np.bool_]) -> bool:
-        """Return True if anything is drawn with (chunks,) bool resident chunks."""
+        """Return whether a viewer draws anything with (chunks,) bool resident chunks."""
         return bool((resident[self.roots] if self.roots else resident).any())
 
 
 class ChunkCache:
     """Holds chunks, and evicts the least recently used ones when it is full.
 
-    A chunk is used when it arrives and as long as it is wanted; among wanted chunks the more important one counts as
+    A chunk is used when it arrives and as long as it is wanted; among wanted chunks a more important one counts as
     more recently used. Wanted chunks beyond the capacity are not fetched, since they would evict more important ones or
     be evicted by them. Spark's pager works the same way. Chunks with roots are always wanted, and come first.
     `UnfitError` if the capacity is less than the number of trees.
 
     Attributes:
         requested: the wanted chunks, each once, the most important first.
-        admitted: the first of them, as many as fit; they are never evicted.
+        admitted: as many of the first requested chunks as fit; they are never evicted.
     """
 
     def __init__(self, chunks: Chunks, capacity: int | None = None) -> None:
@@ -101,26 +96,23 @@ class ChunkCache:
         """Return the admitted chunks that are not resident, the most important first."""
         return [chunk for chunk in self.admitted if chunk not in self._resident]
 
-    def want(self, requested: Iterable[int]) -> None:
-        """Replace the list of wanted chunks, the most important first; `ValueError` if there is no such chunk.
+    def want(self, requested: Sequence[int]) -> None:
+        """Replace the list of wanted chunks, the most important first.
 
-        The roots of all trees come before them, in this order, too, whether listed or not.
+        Chunks with roots come before them: first the listed ones, in this order, then all others.
         """
-        named = [int(chunk) for chunk in requested]
-        if named and not 0 <= min(named) <= max(named) < len(self._chunks.sizes):
-            raise ValueError(f"chunks {min(named)} to {max(named)} are wanted, but there are {len(self._chunks.sizes)}")
         self._arrange()  # chunks wanted until now count as used until now
-        roots = [chunk for chunk in named if chunk in self._roots]
-        self.requested = list(dict.fromkeys([*roots, *self._chunks.roots, *named]))
+        roots = [chunk for chunk in requested if chunk in self._roots]
+        self.requested = list(dict.fromkeys([*roots, *self._chunks.roots, *requested]))
         self.admitted = self.requested[: self._capacity]
         self._is_admitted = frozenset(self.admitted)
         self._arrange()
 
     def arrive(self, chunk: int) -> int | None:
-        """Add a chunk that has been fetched, and return the one that was evicted; None if none was.
+        """Add a fetched chunk, and return the evicted one, or None.
 
-        That is the least recently used of the unwanted chunks, or else the least important. It may be the new chunk
-        itself, if it is no longer wanted.
+        The least recently used of the unwanted chunks is evicted, or else the least important wanted one. That may be
+        the new chunk itself, if it is no longer wanted.
         """
         self._resident[chunk] = None
         # All admitted chunks fit, so if an admitted one exceeds the capacity, the first in the order of eviction is not
@@ -150,26 +142,26 @@ Request = tuple[int, int]
 
 
 class ChunkStream:
-    """Fetches the chunks that a viewer wants and keeps them in a cache.
+    """Fetches the chunks that a viewer wants, over a simulated network, into a cache.
 
     For each frame: `advance` to its time, `want` the chunks that its cut reads, and `take_arrivals` for the new ones;
-    `cache.resident()` are then the chunks that can be drawn.
+    a viewer can then draw with `cache.resident()`.
 
     A free fetcher requests the most important admitted chunk that is neither resident nor under way. Requests are not
     cancelled, as in Spark; a chunk that is no longer wanted when it arrives goes into the cache if there is room, or in
     place of one that has not been used for longer. Decoding takes no time, and no request fails.
 
-    A chunk is there when all of its answers are (`Chunks.requests`): that to a first request, and those to the others,
-    which are asked for together then. A request waits for a free connection, in the order of the requests.
+    A chunk arrives with the last of its answers (`Chunks.requests`): first one to a single request, then those to the
+    others, which are sent together. Requests wait for a free connection, in order.
 
-    Where a viewer needs headers first (`Chunks.headers`), they are requested at the start, all at once and besides the
-    fetchers; a fetcher with a chunk of such a tree waits for its header, as in Spark.
+    If a viewer needs headers first (`Chunks.headers`), it requests them at the start, all at once and without fetchers;
+    a fetcher with a chunk of such a tree waits for its header, as in Spark.
 
     The state changes at events only, so the result does not depend on the steps in which time advances.
 
     Attributes:
         now: the current time, seconds.
-        received: bytes that have arrived since the start, of headers too.
+        received: bytes received since the start, headers included.
     """
 
     def __init__(
@@ -208,31 +200,31 @@ class ChunkStream:
             pass
         self.now = to_time
 
-    def want(self, requested: Iterable[int]) -> None:
-        """Replace the list of wanted chunks, the most important first, and raise `ValueError`, as `ChunkCache.want`."""
+    def want(self, requested: Sequence[int]) -> None:
+        """Replace the list of wanted chunks, see `ChunkCache.want`, and request them."""
         self.cache.want(requested)
         self._next = 0
         self._request(self.now)
         self.advance(self.now)  # with an instant network everything arrives now
 
     def take_arrivals(self) -> list[int]:
-        """Return the chunks that arrived since the last call, in order; evicted ones, too."""
+        """Return the chunks that arrived since the last call, in order, evicted ones included."""
         arrived, self._arrived = self._arrived, []
         return arrived
 
     def take_bytes(self) -> int:
-        """Return bytes of what has arrived since the last call, headers and chunks."""
+        """Return the bytes received since the last call, headers included."""
         taken, self._taken = self.received - self._taken, self.received
         return taken
 
     def step(self) -> bool:
-        """Go on to the next event, the start or end of a transfer; False if nothing is under way."""
+        """Advance to the next event, the start or end of a transfer; return False if nothing is under way."""
         going = self._step(math.inf)
         self.now = self._since if going else self.now
         return going
 
-    def complete_in(self, requested: Iterable[int]) -> float | None:
-        """Seconds until all these chunks are resident if no others are requested; None if the cache is too small."""
+    def complete_in(self, requested: Sequence[int]) -> float | None:
+        """Return the seconds until all these chunks are resident, if no others are; None if the cache is too small."""
         future = self._copy()
         future.want(requested)
         if len(future.cache.admitted) < len(future.cache.requested):
@@ -268,7 +260,7 @@ class ChunkStream:
                     self._ask(time, (chunk, 0))
 
     def _ask(self, time: float, request: Request) -> None:
-        """Send a request, once there is a connection for it."""
+        """Send a request, or queue it until a connection is free."""
         if len(self._requested) + len(self._transfers) < self._connections:
             self._requested.append((time + self._network.latency, request))
         else:
@@ -279,7 +271,7 @@ class ChunkStream:
         return self._headers[-1 - chunk][0] if chunk < 0 else self._chunks.requests[chunk][part]
 
     def _step(self, until: float) -> bool:
-        """Process the next event, the start or end of a transfer; False if none is due until a time."""
+        """Process the next event, the start or end of a transfer, if it is due by a time; return whether it was."""
         if not self._requested and not self._transfers:
             return False
         begin = self._requested[0][0] if self._requested else math.inf
@@ -320,7 +312,7 @@ class ChunkStream:
         return True
 
     def _end_header(self, tree: int, time: float) -> None:
-        """Process an answer with the beginning of a file: request the next one, or the chunks that wait."""
+        """Process an answer with a part of a header: request the next part, or the waiting chunks."""
         _, *rest = self._headers[tree]
         if rest:
             self._headers[tree] = tuple(rest)

@@ -27,37 +27,35 @@ FETCHERS = 3
 #: Width of the blending range of continuous cuts, as a ratio of pixel scales.
 BLEND = 1.25
 
-
 #: Factors that the traversal multiplies in float32.
 FACTOR = Range(0, 10**12)
-
 
 #: Uses of a budget: spend all of it, or only limit the levels that follow from distances.
 BUDGET_MODES = ("target", "limit")
 
-#: PlayCanvas's budget of splats, and the chunk files that it loads at a time, by default.
+#: PlayCanvas's default budget of splats, and number of chunk files that it fetches concurrently.
 PLAYCANVAS_BUDGET, PLAYCANVAS_FETCHERS = 1_000_000, 2
 
-#: Requests to a host that browsers have under way at a time, by HTTP/1.1; a chunk file takes seven or eight.
+#: Concurrent requests of browsers to a host over HTTP/1.1; a chunk file takes seven or eight requests.
 CONNECTIONS = 6
 
 #: The shortest base distance, world units.
 LEAST_BASE_DISTANCE = 0.1
 
-#: Requests of CesiumJS to one server that are under way at a time.
+#: Concurrent requests of CesiumJS to one server.
 CESIUM_FETCHERS = 18
 
 
 @dataclass(frozen=True)
 class DetailRule(CheckedSettings):
-    """Rule by which a viewer chooses detail levels: names, defaults and bounds are those of PlayCanvas 2.23.
+    """Rule by which a viewer chooses detail levels, with the defaults and bounds of PlayCanvas 2.23.
 
-    They are its `splatBudgetMode`, `lodBaseDistance` (seen by a camera with a field of view of 45 degrees),
+    Its names there are `splatBudgetMode`, `lodBaseDistance` (seen by a camera with a field of view of 45 degrees),
     `lodMultiplier`, `lodBehindPenalty`, `lodDistanceShrink`, `lodRangeMin`, `lodRangeMax` and `lodUnderfillLimit`.
 
     Attributes:
-        shrink: 0..1, share of its excess over the median size by which the bound of a region shrinks when its distance
-            is measured.
+        shrink: 0..1, share of the excess of a region's bound over the median size by which the bound shrinks when
+            its distance is measured.
         finest, coarsest: the levels that may be chosen.
 
     Raises:
@@ -110,8 +108,8 @@ class LodSettings(CheckedSettings):
         budget: maximum number of splats, all instances together; by default that of Spark 2 on a desktop.
         foveation: weight of nodes by direction, for instances without their own foveation; by default Spark 2's.
         continuous: width of continuous cuts, the ratio of the pixel scales between which a node fades into its
-            children, above 1 (see `continuous`); None for ordinary cuts.
-        detail: choice of the detail levels of Streamed SOG; all but this and the budget applies to trees only.
+            children, above 1 (see `viewers.continuous`); None for ordinary cuts.
+        detail: choice of the detail levels of Streamed SOG; other fields but the budget are for trees only.
     """
 
     budget: int = PRESETS["desktop"]
@@ -128,7 +126,7 @@ class LodSettings(CheckedSettings):
     detail: DetailRule = field(default_factory=DetailRule)
 
     def limit(self, fov_y: float, height: int) -> float:
-        """Pixel scale at or below which no node is refined; by vertical field of view (radians) and height (pixels)."""
+        """Return the pixel scale at or below which no node is refined, for a `fov_y` in radians, a height in pixels."""
         if self.pixel_scale_limit is not None:
             return self.pixel_scale_limit
         return pixel_limit(fov_y, height, self.render_scale)

@@ -327,25 +327,10 @@ def test_a_copy_of_a_cache_is_independent() -> None:
     assert cache.requested == [0, 1]
 
 
-def test_chunks_are_numbered_across_trees_and_may_be_requested_by_an_array() -> None:
-    chunks = sized([[5, 6], [7], [8, 9]])
-    assert chunks.sizes == [5, 6, 7, 8, 9]
-    assert chunks.roots == [0, 2, 3]
-    cache = ChunkCache(sized([[1, 1, 1]]))
-    cache.want(np.array([2, 1], np.uint32))
-    assert cache.requested == [0, 2, 1]
-    assert all(type(chunk) is int for chunk in cache.requested)
-
-
 @pytest.mark.parametrize(
     ("act", "message"),
     [
-        (lambda: ChunkCache(sized([[1, 1], [1]])).want([3]), "there are 3"),
-        (lambda: ChunkCache(sized([[1, 1], [1]])).want([-1]), "there are 3"),
         (lambda: ChunkCache(sized([[1], [1, 1]]), 1), "the roots of 2 trees"),
-        (lambda: sized([[1], []]), "chunks of tree 1"),
-        (lambda: sized([[1], [2, -1]]), "chunks of tree 1"),
-        (lambda: sized([[1]], [[1], [2]]), "there are 2 headers of 1 trees"),
         (lambda: Network(0.0, 0.0, 3), "bandwidth is 0"),
         (lambda: Network(math.nan, 0.0, 3), "bandwidth is nan"),
         (lambda: Network(1.0, -1.0, 3), "latency is -1"),
@@ -357,7 +342,7 @@ def test_chunks_are_numbered_across_trees_and_may_be_requested_by_an_array() -> 
         ),
     ],
 )
-def test_impossible_requests_sizes_times_and_networks_are_refused(act: Callable[[], object], message: str) -> None:
+def test_small_caches_impossible_times_and_networks_are_refused(act: Callable[[], object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         act()
 
