@@ -1,4 +1,4 @@
-"""Runs the real Spark in a Node process, and decodes its in-memory layouts to numpy columns."""
+"""Runs the real Spark in a Node process, and returns its in-memory layouts."""
 
 from __future__ import annotations
 
@@ -11,41 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sparklod_cli.codecs import layouts
 from sparklod_cli.model.lod_tree import CHUNK_NODES
+from sparklod_cli.model.splats import Splats
 from tests.interop.node import Node
 
-#: ExtSplats: its two arrays of 16 bytes a splat.
-EXT0 = np.dtype([("center", "<f4", 3), ("alpha", "<f2"), ("padding", "<u2")])
-EXT1 = np.dtype([("rgb", "<f2", 3), ("log_scale", "<f2", 3), ("quat", "<u4")])
 #: A node of the LodTree. child_count is read as a word, so that a count beyond its uint16 is noticed.
 NODE = np.dtype([("center", "<f2", 3), ("size", "<f2"), ("child_count", "<u4"), ("child_start", "<u4")])
-assert EXT0.itemsize == EXT1.itemsize == NODE.itemsize == 16
-
-
-@dataclass(frozen=True)
-class Reply:
-    """What Spark read from one file: its arrays of uint32, as they are in memory."""
-
-    count: int
-    lod: bool
-    words: Mapping[str, NDArray[np.uint32]]
-
-    def rows(self, name: str, dtype: np.dtype[Any]) -> NDArray[Any]:
-        """Return (count,) structs of an array, without the rest of the last row that Spark allocates."""
-        return self.words[name].view(dtype)[: self.count]
-
-
-@dataclass(frozen=True)
-class ExtSplats:
-    """Decoded ExtSplats of N splats, with `NODE` rows if the file has a tree."""
-
-    center: NDArray[np.float32]
-    alpha: NDArray[np.float64]
-    rgb: NDArray[np.float64]
-    log_scale: NDArray[np.float64]
-    quat_xyzw: NDArray[np.float64]
-    sh: NDArray[np.float64]
-    nodes: NDArray[Any] | None
 
 
 @dataclass(frozen=True)
@@ -82,26 +54,6 @@ class Spark:
         self._node = Node("spark_load.mjs", package_dir, scratch=scratch)
         self.close = self._node.close
 
-    def _ask(
-        self,
-        method: str,
-        source: bytes | Path,
-        options: Mapping[str, Any],
-        codes: Mapping[str, NDArray[np.uint32]] | None = None,
-    ) -> Reply:
-        self._asked += 1
-        out = self._scratch / str(self._asked)
-        path = source if isinstance(source, Path) else out.with_suffix(".spz")
-        if isinstance(source, bytes):
-            path.write_bytes(source)
-        request = {"method": method, "path": str(path), "name": path.name, "options": options, "out": str(out)}
-        with self._files(codes or {}) as words:
-            answer = self._node.ask(request | {"words": words})
-        words = {name: np.fromfile(file, "<u4") for name, file in answer["arrays"].items()}
-        for file in answer["arrays"].values():
-            Path(file).unlink()
-        return Reply(answer["numSplats"], answer["lod"], words)
-
     @contextmanager
     def _files(self, arrays: Mapping[str, NDArray[np.uint32]]) -> Iterator[dict[str, str | list[str]]]:
         """Write arrays to files for a request: a path for each option, or several if its names are "option.0" etc."""
@@ -116,21 +68,10 @@ class Spark:
         for file in files:
             file.unlink()
 
-    def load(self, source: bytes | Path, *, lod: bool = False) -> ExtSplats:
+    def load(self, source: bytes | Path, *, lod: bool = False) -> Splats:
         """Load a file, or the bytes of an SPZ file, as ExtSplats; `lod` builds a tree if it has none."""
-        reply = self._ask("loadExtSplats", source, {"lod": lod})
-        ext0, ext1 = reply.rows("ext0", EXT0), reply.rows("ext1", EXT1)
-        nodes = reply.words["lodTree"].view(NODE) if reply.lod else None
-        assert reply.lod == ("lodTree" in reply.words)
-        return ExtSplats(
-            center=ext0["center"],
-            alpha=ext0["alpha"].astype(np.float64),
-            rgb=ext1["rgb"].astype(np.float64),
-            log_scale=ext1["log_scale"].astype(np.float64),
-            quat_xyzw=_decode_quat(ext1["quat"]),
-            sh=_decode_ext_sh(reply),
-            nodes=nodes,
-        )
+        words = self.load_words("Ext", source, lod=lod)
+        return layouts.unpack_ext({name: values for name, values in words.items() if name != "lodTree"})
 
     def load_words(
         self,
@@ -145,9 +86,21 @@ class Spark:
         `codes` is the palette of SH for a chunk of a RAD file: the arrays whose names have "Codes" of its first chunk.
         `options` go to the worker: `lod` builds a tree, `encoding` sets the ranges of PackedSplats.
         """
-        reply = self._ask(f"load{layout}Splats", source, options, codes)
+        self._asked += 1
+        out = self._scratch / str(self._asked)
+        path = source if isinstance(source, Path) else out.with_suffix(".spz")
+        if isinstance(source, bytes):
+            path.write_bytes(source)
+        request = {"method": f"load{layout}Splats", "path": str(path), "name": path.name, "options": options}
+        with self._files(codes or {}) as words:
+            answer = self._node.ask(request | {"out": str(out), "words": words})
         width = dict.fromkeys(("sh1", "sh1Codes"), 2 if layout == "Packed" else 4)
-        return {name: words.reshape(-1, width.get(name, 4))[: reply.count] for name, words in reply.words.items()}
+        arrays = {}
+        for name, file in answer["arrays"].items():
+            arrays[name] = np.fromfile(file, "<u4").reshape(-1, width.get(name, 4))[: answer["numSplats"]]
+            Path(file).unlink()
+        assert answer["lod"] == ("lodTree" in arrays)
+        return arrays
 
     def keep_tree(self, words: NDArray[np.uint32]) -> int:
         """Load a LodTree, four words a node, into Spark's worker; returns its id."""
@@ -211,32 +164,3 @@ class Spark:
         out.unlink()
         chunks = [(tree, chunk) for tree, chunk in answer["chunks"]]
         return Traversed(np.split(indices, np.cumsum(answer["counts"])[:-1]), chunks, answer["pixelLimit"])
-
-
-def _decode_quat(code: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Decode quaternions: the axis in 10 + 10 bits of an octahedral map, the angle of 0..pi in 12 bits."""
-    xy = np.stack([code & 1023, code >> 10 & 1023], axis=1) / 1023 * 2 - 1
-    z = 1 - np.abs(xy).sum(axis=1, keepdims=True)
-    xy -= np.copysign(np.maximum(-z, 0), xy)  # unfold the lower half
-    axis = np.concatenate([xy, z], axis=1)
-    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-    half = ((code >> 20) / 4095 * np.pi / 2)[:, None]
-    return np.concatenate([axis * np.sin(half), np.cos(half)], axis=1)
-
-
-def _decode_ext_sh(reply: Reply) -> NDArray[np.float64]:
-    """Decode SH: a word a coefficient, with a byte and a sign for each of r, g and b, and one exponent for all.
-
-    sh1 has the three coefficients of degree 1 and the first of degree 2, sh2 the other four; sh3a and sh3b degree 3.
-    """
-    arrays = [
-        reply.words[name].reshape(-1, 4)[: reply.count]
-        for name in ("sh1", "sh2", "sh3a", "sh3b")
-        if name in reply.words
-    ]
-    coefficients = (0, 3, 8, 0, 15)[len(arrays)]
-    words = np.concatenate([np.zeros((reply.count, 0), np.uint32), *arrays], axis=1)[:, :coefficients, None]
-    channel = np.arange(3, dtype=np.uint32)
-    magnitude = words >> 8 * channel & 255
-    sign = 1 - 2.0 * (words >> (24 + channel) & 1)
-    return sign * magnitude / 255 * 2.0 ** ((words >> 27).astype(np.float64) - 15)

@@ -242,9 +242,9 @@ def test_spark_reads_the_same_splats(spark: Spark, file: File) -> None:
     within(got.center, splats.center, 2.0**-21 * np.abs(splats.center).max())
     within(got.rgb, splats.rgb, HALF * np.abs(splats.rgb) + TINY)
     log_scale = np.log(splats.scale.astype(np.float64))
-    within(got.log_scale, log_scale, HALF * np.abs(log_scale) + TINY)
+    within(np.log(got.scale), log_scale, HALF * np.abs(log_scale) + TINY)
     assert (rotation_degrees(got.quat_xyzw, splats.quat_xyzw) <= spark_degrees(file, splats.quat_xyzw)).all()
-    within(got.alpha, splats.opacity, HALF * splats.opacity + TINY)
+    within(got.opacity, splats.opacity, HALF * splats.opacity + TINY)
     sh = splats.sh
     if "compressed" in file.path.name:  # Spark maps bytes 0..255 to -4..4, not 256 parts
         sh = np.clip((sh.astype(np.float64) / 8 + 0.5) * 256 - 0.5, 0, 255) / 255 * 8 - 4

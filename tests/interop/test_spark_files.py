@@ -39,7 +39,7 @@ from tests.codecs.cases import encode, linear, rotation_degrees
 from tests.codecs.writers import as_ply
 from tests.conftest import FIXTURES, Capture, real_scene
 from tests.interop.node import PROGRAMS
-from tests.interop.spark import Spark
+from tests.interop.spark import NODE, Spark
 from tests.interop.spark_words import (
     Floats,
     Words,
@@ -195,8 +195,9 @@ def test_spark_reads_unusual_and_real_trees_of_spz(
 
 def test_spark_keeps_the_tree_of_a_file_if_the_page_asks_for_one(spark: Spark) -> None:
     """`SplatMesh({lod: true})` decodes in another way, and builds a tree if the file has none."""
-    scene, nodes = tree(2_000, 3), spark.load(encode(spz, tree(2_000, 3)), lod=True).nodes
-    assert scene.tree is not None and nodes is not None
+    scene = tree(2_000, 3)
+    nodes = spark.load_words("Ext", encode(spz, scene), lod=True)["lodTree"].view(NODE)[:, 0]
+    assert scene.tree is not None
     np.testing.assert_array_equal(nodes["child_count"], scene.tree.child_count)
     np.testing.assert_array_equal(nodes["child_start"], scene.tree.child_start)
 

@@ -239,17 +239,6 @@ def test_spherical_harmonics_of_degree_3_are_paged_as_packed_splats(page: Page, 
     check_paged(page, files, expected, camera, 4_000, "Packed")
 
 
-def test_a_noted_up_axis_changes_no_pixel(page: Page, tmp_path: Path) -> None:
-    splats = random_splats(300, sh_degree=1)
-    scene, camera = Scene(*quick.build(splats)), cameras_of(splats)[0]
-    pictures = []
-    for up in (None, "y"):
-        write(tmp_path / f"{up}.rad", replace(scene, up=up))
-        pictures.append(drawn(page, tmp_path / f"{up}.rad", camera, 1_000, "Ext", pages=4).rounded)
-    assert pictures[0][..., :3].max() > 0.1
-    np.testing.assert_array_equal(*pictures)
-
-
 # --- The pages of docs/spark.md ---------------------------------------------------------------------------------------
 
 #: The camera of the page, in the axes of the file: y and z point the other way.
