@@ -130,7 +130,9 @@ def choose(
     present = resident | (scene.counts == 0)
     refinable = np.ones(scene.tiles, np.bool_)  # all children are there
     np.logical_and.at(refinable, scene.parent[1:], present[1:])
-    distance = distances(scene, view, object_to_world)
+    eye = np.linalg.solve(object_to_world, view.camera_to_world[:, 3])[:3]
+    nearest = np.clip(eye, scene.bounds[:, 0], scene.bounds[:, 1])
+    distance = np.linalg.norm(nearest - eye, axis=1)
     exceeds = (scene.errors > limit * distance) | (scene.counts == 0)
     desired = visible & exceeds & ~scene.is_leaf
     visited, wanted = np.zeros(scene.tiles, np.bool_), np.zeros(scene.tiles, np.bool_)
@@ -142,14 +144,6 @@ def choose(
         visited[tiles] = wanted[tiles] & refinable[above]
     drawn = visited & visible & ~(desired & refinable)
     return TileChoice(drawn, drawn & desired, wanted, distance)
-
-
-def distances(scene: TileScene, view: Camera, object_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (T,) distances from the camera to the boxes of tiles, in units of the scene; 0 inside."""
-    eye = np.linalg.solve(object_to_world, view.camera_to_world[:, 3])[:3]
-    nearest = np.clip(eye, scene.bounds[:, 0], scene.bounds[:, 1])
-    found: NDArray[np.float64] = np.linalg.norm(nearest - eye, axis=1)
-    return found
 
 
 def in_picture(scene: TileScene, view: Camera, object_to_world: NDArray[np.float64]) -> Mask:

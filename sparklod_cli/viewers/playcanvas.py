@@ -10,7 +10,7 @@ import functools
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -116,21 +116,18 @@ class DetailChoice:
 
 def choose(instances: Sequence[Distant], budget: int, rule: DetailRule) -> DetailChoice:
     """Return the levels that a viewer shows of one or more instances, all within one budget of splats."""
-    limit = rule.mode == "limit"
-    coarsest = sum(int(each.chains.count[:, -1].sum()) for each in instances)
-    finest = sum(int(each.chains.count[:, 0].sum()) for each in instances)
+    limit, keys = rule.mode == "limit", [_keys(each, rule) for each in instances]
+    finest, coarsest = (sum(int(each.chains.count[:, place].sum()) for each in instances) for place in (0, -1))
     if coarsest >= budget:
-        return _chosen(instances, [np.full(len(each.chains.level), -1) for each in instances], "budget")
+        return _chosen(instances, keys, 0, "budget")
     if not limit and finest <= budget:
-        return _chosen(instances, [np.zeros(len(each.chains.level), np.int64) for each in instances], "exhausted")
-    keys = [_keys(each, rule) for each in instances]
+        return _chosen(instances, keys, BINS * PARTS, "exhausted")
     if limit:
-        due = [(key >= DUE * PARTS).sum(axis=1) for key in keys]
-        chosen = _chosen(instances, due, "distance")
+        due = any((key >= DUE * PARTS).any() for key in keys)
+        chosen = _chosen(instances, keys, DUE * PARTS, "distance" if due else "exhausted")
         if chosen.splats <= budget:
-            return chosen if any(places.any() for places in due) else replace(chosen, reason="exhausted")
-    threshold = _threshold(instances, keys, budget - coarsest, DUE if limit else BINS)
-    return _chosen(instances, [(key >= threshold).sum(axis=1) for key in keys], "budget")
+            return chosen
+    return _chosen(instances, keys, _threshold(instances, keys, budget - coarsest, DUE if limit else BINS), "budget")
 
 
 def _keys(instance: Distant, rule: DetailRule) -> Levels:
@@ -167,12 +164,13 @@ def _first_over(number: Levels, saved: Levels, room: int, count: int) -> tuple[i
     return first, room - (int(added[first - 1]) if first else 0)
 
 
-def _chosen(instances: Sequence[Distant], places: Sequence[Levels], reason: str) -> DetailChoice:
+def _chosen(instances: Sequence[Distant], keys: Sequence[Levels], threshold: int, reason: str) -> DetailChoice:
+    """Return the levels after all steps whose keys, see `_keys`, are at least a threshold."""
     levels, splats = [], 0
-    for instance, place in zip(instances, places, strict=True):
-        rows = np.arange(len(place))
-        levels.append(instance.chains.level[rows, place])
-        splats += int(instance.chains.count[rows, place].sum())
+    for instance, key in zip(instances, keys, strict=True):
+        at = np.arange(len(key)), (key >= threshold).sum(axis=1)
+        levels.append(instance.chains.level[at])
+        splats += int(instance.chains.count[at].sum())
     return DetailChoice(tuple(levels), splats, reason)
 
 

@@ -237,10 +237,11 @@ class Scenes:
         fixed = sum(loaded.leaf_count for loaded in self.of_instance if loaded.kind is None)
         return PlayCanvasViewer(self.forest, instances, settings.detail, fixed=fixed, remembers=remembers)
 
-    def full(self) -> Cut:
-        """Full detail: all leaves, and all splats of scenes without trees."""
+    def full(self, *, nodes: bool = False) -> Cut:
+        """Return full detail: all leaves, and all splats of scenes without trees; or all `nodes`, of all levels."""
         pairs = zip(self.instances, self.of_instance, strict=True)
-        return Cut(tuple(Part(loaded, loaded.leaves, None, at.object_to_world) for at, loaded in pairs))
+        indices = ((np.arange(each.count) if nodes else each.leaves, each, at) for at, each in pairs)
+        return Cut(tuple(Part(loaded, index, None, at.object_to_world) for index, loaded, at in indices))
 
     def cut_of(self, found: TreeCut | BlendedCut) -> Cut:
         """Return the cut of all instances: the nodes of a viewer's cut, and all splats of scenes without cuts."""
@@ -311,10 +312,7 @@ class CutFinder:
 
     def candidates(self) -> Cut:
         """Return all splats that the cut of any camera may have: whole trees, all detail levels, all tiles."""
-        if self.viewer is None:
-            return self.scenes.full()
-        pairs = zip(self.scenes.instances, self.scenes.of_instance, strict=True)
-        return Cut(tuple(Part(loaded, np.arange(loaded.count), None, at.object_to_world) for at, loaded in pairs))
+        return self.scenes.full(nodes=self.viewer is not None)
 
 
 def read_scenes(
