@@ -84,11 +84,11 @@ hold, 130 interrupted. Shell completion: sparklod completion --install.
 
 
 class _EndOfFileError(Exception):
-    """Carries an `EOFError` past click, which takes it for Ctrl-D and says that a person interrupted."""
+    """Carries an `EOFError` past click, which would report it as Ctrl-D of a person."""
 
 
 class Sparklod(click.Group):
-    """The group of all commands, each imported when it is needed."""
+    """Group of all commands, which imports each when it is needed."""
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -117,13 +117,13 @@ class Sparklod(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the lines of the commands, without loading one."""
+        """Write the lines of the commands, without importing any."""
         with formatter.section("Commands"):
             formatter.write_dl(list(COMMANDS.items()))
 
 
 def _unknown(name: str) -> str:
-    """Return the error for an unknown command, with the command that was probably meant, or all of them."""
+    """Return the error for an unknown command, which names the most similar command, or all."""
     if os.path.isfile(name):  # noqa: PTH113
         import shlex  # needed after a mistake only
 
@@ -204,7 +204,7 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _failed(error: BaseException, verbosity: Verbosity) -> int:
-    """Report an unexpected error, or that memory ran out, in one line; return the exit code.
+    """Report an unexpected error, or a lack of memory, in one line; return the exit code.
 
     Last resort: reaching this line is a bug, but a user has no use for a traceback.
     """

@@ -54,7 +54,7 @@ from .writing_options import (
 if TYPE_CHECKING:
     from ..api.bake_jobs import Outcome, Pair
     from ..api.converting import Converted
-    from ..bake.settings import Baked, BakeSettings, Source
+    from ..bake.settings import Baked, Source
     from ..codecs.losses import Losses
     from ..model.instances import Instance
 
@@ -240,7 +240,7 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
     """
     options = values_of(ctx, BuildLodOptions)
     writing, general = options.writing, options.writing.general
-    form, pairs, instances = _check(ctx, options)
+    form, method, pairs, instances = _check(ctx, options)
     failed, console = False, Console(quiet=general.quiet, verbose=general.verbose)
     with console, contextlib.ExitStack() as stack:
         from ..api.bake_jobs import bake_files, merged_source
@@ -251,7 +251,26 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
             if any(each.lod_scale != 1 or each.foveation is not None for each in instances):
                 viewers = "lod_scale and foveation of instances are for viewers, and no part of a tree"
                 console.say(f"{options.scene}: {viewers}")
-        settings = _settings(ctx, options, form)
+        refine = None
+        if options.refine is not None:
+            from ..fitting.fit_settings import FitSettings
+
+            refine = FitSettings(options.refine or None, options.seed, device=options.device)
+        names_tree = isinstance(options.output, (Path, Address)) and options.output != DASH and form.suffix in TREES
+        settings = writing.settings(
+            ctx,
+            form,
+            method=method,
+            base=options.base,
+            growth=options.growth or (DETAIL_GROWTH if form.manifest else DEFAULT_GROWTH),
+            detail=options.detail if form.name == DETAIL else None,
+            tiles=options.tiles if form.name == TILED else None,
+            environment=options.environment,
+            environment_beyond=options.environment_beyond,
+            refine=refine,
+            camera_path=options.camera_path,
+            converts=options.form is not None or names_tree or bool(form.manifest),
+        )
         console.announce_compiling(settings)
         outcomes = bake_files(
             pairs,
@@ -277,10 +296,10 @@ def build_lod(ctx: click.Context, /, **_: Any) -> None:
         ctx.exit(1)
 
 
-def _check(ctx: click.Context, options: BuildLodOptions) -> tuple[Form, Sequence[Pair], list[Instance]]:
-    """Return the format, inputs with their outputs, and the instances of --scene.
+def _check(ctx: click.Context, options: BuildLodOptions) -> tuple[Form, str, Sequence[Pair], list[Instance]]:
+    """Return the format, the method, the inputs with their outputs, and the instances of --scene.
 
-    Raises a `click.UsageError` where options or names of files contradict each other.
+    Raises a `click.UsageError` if options or names of files contradict each other.
     """
     inputs, output = options.inputs, options.output
     file, folder = (None, output.path) if isinstance(output, Folder) else (output, options.output_dir)
@@ -323,7 +342,7 @@ def _check(ctx: click.Context, options: BuildLodOptions) -> tuple[Form, Sequence
         outputs = [target for source, target in pairs if not is_same_place(source, target)]
     method = options.method or (QUALITY if form.manifest else METHODS[0])
     check_outputs(ctx, form, outputs, ENDINGS, instances, method=method)
-    return form, pairs, instances
+    return form, method, pairs, instances
 
 
 def _output_of(options: BuildLodOptions, form: Form, source: Place, folder: Place | None) -> Place:
@@ -335,30 +354,6 @@ def _output_of(options: BuildLodOptions, form: Form, source: Place, folder: Plac
     if options.refine is not None and name == source.name:
         name = f"{stem}-lod-refined{form.suffix}"
     return (folder or source.parent) / name
-
-
-def _settings(ctx: click.Context, options: BuildLodOptions, form: Form) -> BakeSettings:
-    """Return the settings of bakes; loads numpy."""
-    refine = None
-    if options.refine is not None:
-        from ..fitting.fit_settings import FitSettings
-
-        refine = FitSettings(options.refine or None, options.seed, device=options.device)
-    names_tree = isinstance(options.output, (Path, Address)) and options.output != DASH and form.suffix in TREES
-    return options.writing.settings(
-        ctx,
-        form,
-        method=options.method or (QUALITY if form.manifest else METHODS[0]),
-        base=options.base,
-        growth=options.growth or (DETAIL_GROWTH if form.manifest else DEFAULT_GROWTH),
-        detail=options.detail if form.name == DETAIL else None,
-        tiles=options.tiles if form.name == TILED else None,
-        environment=options.environment,
-        environment_beyond=options.environment_beyond,
-        refine=refine,
-        camera_path=options.camera_path,
-        converts=options.form is not None or names_tree or bool(form.manifest),
-    )
 
 
 def report(
@@ -424,58 +419,81 @@ def _lines(made: Baked | Converted, name: str, target: str, *, verbose: bool) ->
     from ..bake.settings import Baked
     from ..model.selection import describe
 
-    splats, simplified = count_of(made.splats, "splat"), None
+    baked = made if isinstance(made, Baked) else None
+    simplified = None if baked is None else baked.simplified
+    splats, notes = count_of(made.splats, "splat"), list[str]()
     read = f"{splats}, SH {made.sh_degree}"
     if isinstance(made, Baked):
-        losses: Losses | None = made.simplified
-        simplified, contents = made.simplified, _contents(made)
+        contents, *notes = _contents(made)
     else:
-        losses = made
         arrays = ", ".join(f"{name} uint32{list(shape)}" for name, shape in made.arrays.items())
         contents, read = arrays or read, splats if made.nodes is None else count_of(made.nodes, "node")
     seconds = sum(made.seconds.values())
     yield f"{name}  {read}  ->  {target}  {contents}, {format_size(made.bytes)}, {seconds:.1f} s"
-    if isinstance(made, Baked):
-        yield from _notes(made)
+    yield from notes
     if made.dropped:
         yield f"left out: {describe(made.dropped)}"
-    yield from made.notes if isinstance(made, Baked) else ()
+    yield from () if baked is None else baked.notes
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in made.seconds.items())
-    if losses is None:
-        assert isinstance(made, Baked)
-        yield from _clamping(made, verbose=verbose)
-        tree = f"{made.method} tree" if made.method is not None else "the same tree"
-        tree += ", refined" if made.refine is not None else ""
-        about = f"{made.format} -> {tree} -> {_encoding(made)}"
-    else:
-        if simplified is not None and simplified.faint > LEAST_SHARE * simplified.splats:
+    if not isinstance(made, Baked):
+        yield from _losses(made, made.splats, made.output_format)
+        about = f"{made.format} -> {made.output_format}"
+    elif simplified is not None:
+        if simplified.faint > LEAST_SHARE * simplified.splats:
             share = percent_of(simplified.faint / simplified.splats)
             yield f"{share} of the splats, merged across wide gaps, are too faint to be drawn; keep more splats"
-        yield from _losses(losses, made.splats if simplified is None else simplified.splats, made.output_format)
-        about = made.format if isinstance(made, Baked) else f"{made.format} -> {made.output_format}"
+        yield from _losses(simplified, simplified.splats, made.output_format)
+        about = made.format
+    else:
+        yield from _clamping(made, verbose=verbose) if made.clamps else ()
+        tree = f"{made.method} tree" if made.method is not None else "the same tree"
+        tree += ", refined" if made.refine is not None else ""
+        about = f"{made.format} -> {tree} -> {_encoding(made)}" if verbose else ""
     if verbose:
         yield f"{about}; {stages}"
-    if verbose and isinstance(made, Baked) and made.blocks is not None:
-        written, read = (format_size(size or 0) for size in (made.scratch_bytes_written, made.scratch_bytes_read))
-        yield f"out of core in {count_of(made.blocks, 'block')}; scratch: {written} written, {read} read"
+    if verbose and baked is not None and baked.blocks is not None:
+        written, read = (format_size(size or 0) for size in (baked.scratch_bytes_written, baked.scratch_bytes_read))
+        yield f"out of core in {count_of(baked.blocks, 'block')}; scratch: {written} written, {read} read"
 
 
-def _contents(baked: Baked) -> str:
+def _contents(baked: Baked) -> Iterator[str]:
+    """Yield the contents of an output in a few words, then lines on its levels and on fitting."""
     made, detail, tiles = baked.simplified, baked.detail, baked.tiles
     if made is not None:
         measured = "" if made.psnr is None else f", PSNR {made.psnr:.2f} dB"
-        return f"{count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}"
-    if tiles is not None:
+        yield f"{count_of(made.splats, 'splat')} ({percent_of(made.share)}){measured}"
+    elif tiles is not None:
         place = ", on the Earth" if tiles.georeferenced else ""
-        return f"{count_of(tiles.tiles, 'tile')} of {count_of(tiles.levels, 'level')}{place}"
-    if detail is not None:
+        yield f"{count_of(tiles.tiles, 'tile')} of {count_of(tiles.levels, 'level')}{place}"
+        if tiles.levels > 1:
+            yield f"splats level by level: {', '.join(f'{count:,}' for count in tiles.splats)}"
+    elif detail is not None:
         environment = f", environment of {count_of(detail.environment, 'splat')}" if detail.environment else ""
-        return (
+        yield (
             f"{count_of(len(detail.levels), 'detail level')} of {count_of(detail.regions, 'region')},"
             f" {count_of(detail.chunks, 'chunk file')}{environment}"
         )
-    chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
-    return f"{count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks}"
+        levels = (
+            f"{level.splats:,} splats ({percent_of(level.share)}, error at most {level.worst_error:.2g})"
+            for level in detail.levels[1:]
+        )
+        if len(detail.levels) > 1:
+            yield f"levels below full detail: {', '.join(levels)}"
+    else:
+        chunks = f", {count_of(baked.chunks, 'chunk')}" if baked.chunks else ""
+        yield f"{count_of(baked.nodes, 'node')}, depth {baked.levels - 1}{chunks}"
+    refined = baked.refine if made is None else made.refine
+    if refined is not None:
+        gains = [
+            f"{percent_of(share)} {before:.2f} -> {refined.psnr_after[share]:.2f}"
+            for share, before in refined.psnr_before.items()
+        ]
+        seen = f"held-out PSNR {', '.join(gains)} dB" if gains else "no held-out camera sees anything of it"
+        early = "" if refined.is_complete else ", interrupted"
+        yield (
+            f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
+            f" {percent_of(refined.kept)} of the splats fitted have new values"
+        )
 
 
 def _encoding(baked: Baked) -> str:
@@ -490,34 +508,8 @@ def _encoding(baked: Baked) -> str:
     return f"RAD LoD, {encodings}{palette}"
 
 
-def _notes(baked: Baked) -> Iterator[str]:
-    """Yield lines on levels and on fitting."""
-    if baked.detail is not None and len(baked.detail.levels) > 1:
-        levels = (
-            f"{level.splats:,} splats ({percent_of(level.share)}, error at most {level.worst_error:.2g})"
-            for level in baked.detail.levels[1:]
-        )
-        yield f"levels below full detail: {', '.join(levels)}"
-    if baked.tiles is not None and baked.tiles.levels > 1:
-        yield f"splats level by level: {', '.join(f'{count:,}' for count in baked.tiles.splats)}"
-    refined = baked.refine if baked.simplified is None else baked.simplified.refine
-    if refined is not None:
-        gains = [
-            f"{percent_of(share)} {before:.2f} -> {refined.psnr_after[share]:.2f}"
-            for share, before in refined.psnr_before.items()
-        ]
-        seen = f"held-out PSNR {', '.join(gains)} dB" if gains else "no held-out camera sees anything of it"
-        early = "" if refined.is_complete else ", interrupted"
-        yield (
-            f"refined in {count_of(refined.steps, 'step')}{early}: {seen};"
-            f" {percent_of(refined.kept)} of the splats fitted have new values"
-        )
-
-
 def _clamping(baked: Baked, *, verbose: bool) -> Iterator[str]:
     """Yield a line on the visible effects of clamping, and details of it."""
-    if not baked.clamps:
-        return
     from ..codecs.losses import clamp_matters
     from ..codecs.rad.property_codings import LARGEST_F16
 

@@ -46,10 +46,10 @@ TREES = (".spz", ".rad")
 
 
 class Option(click.Option):
-    """An option that stands under a heading of `--help`.
+    """Option that is listed under a heading of `--help`.
 
     Attributes:
-        bare: its value where it stands alone; another one follows after "=", never as the next argument.
+        bare: value of the option alone, which takes another one only after "="; None for other options.
     """
 
     declared: Setting
@@ -58,9 +58,9 @@ class Option(click.Option):
 
 
 class _Formatter(click.HelpFormatter):
-    """A formatter that breaks lines between words only, never within --an-option."""
+    """Formatter of help that breaks lines at blanks only, never inside --an-option."""
 
-    #: Hyphen in place of "-" at which no line ends, until the text is complete.
+    #: Hyphen at which no line is broken, in place of "-" until the text is complete.
     HYPHEN = "\u2011"
 
     def write_text(self, text: str) -> None:
@@ -76,13 +76,13 @@ class _Formatter(click.HelpFormatter):
 class Command(click.Command):
     """A command whose help lists options under headings, and ends with examples.
 
-    `--help` lists the options under `COMMON`, in a sentence each, if the command has many; `--help-all` lists all.
+    With many options, `--help` lists those under `COMMON`, in a sentence each, and `--help-all` lists all.
 
     Args:
-        options: dataclass whose fields, and those of groups in it, are the options, see `setting`; `--version` follows.
-        examples: lines with a command each, the most useful ones first. A command may take several lines.
-        headings: the order of the headings; others follow in the order of their first options, `GENERAL` last.
-        replaced: options of earlier versions, each with what to write instead.
+        options: dataclass whose fields, and those of its groups, are the options, see `setting`; `--version` follows.
+        examples: command lines, the most useful ones first.
+        headings: the first headings, in order; others follow in the order of their first options, `GENERAL` last.
+        replaced: options of earlier versions and their replacements.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class Command(click.Command):
         return rest
 
     def by_heading(self, ctx: click.Context, *, whole: bool = True) -> dict[str, list[click.Parameter]]:
-        """Return all options, or the common ones and those that print help, by heading, in the order of both."""
+        """Return the options by heading, both in order: all, or only the common ones and those that print help."""
         params = [param for param in self.get_params(ctx) if isinstance(param, click.Option) and not param.hidden]
         if not whole:
             params = [each for each in params if HELP & {*each.opts} or getattr(each, "heading", "") == COMMON]
@@ -161,7 +161,7 @@ class Command(click.Command):
 
 
 def _brief(text: str) -> str:
-    """Return the first sentence of the help of an option, and its default up to a semicolon."""
+    """Return the first sentence of an option's help, and its default up to a semicolon."""
     about, _, default = text.partition("  [")
     sentence = about.split(". ")[0].rstrip(".") + "."
     return f"{sentence}  [{re.split('[];]', default)[0]}]" if default else sentence
@@ -175,9 +175,9 @@ def _print_help_all(ctx: click.Context, param: click.Parameter, value: bool) -> 
 
 
 def refuse_output_among_inputs(ctx: click.Context, *, missing: bool = False) -> None:
-    """Raise a `click.UsageError` if the last input seems to be the output, as with cp.
+    """Raise a `click.UsageError` if the last input was probably meant as the output, as in `cp IN OUT`.
 
-    It does not exist; or it is a file of a format of trees, second after a file of another format.
+    Such an input does not exist, or is a .spz or .rad that follows one file of another format.
     """
     *others, last = ctx.params.get("inputs") or ctx.params.get("files") or (None,)
     if not others or not isinstance(last, Path):
@@ -212,7 +212,7 @@ common = functools.partial(setting, heading=COMMON)
 
 
 def _parameters(group: type[Any], heading: str) -> Iterator[click.Parameter]:
-    """Yield those of a group; its heading is its class attribute `HEADING`, or that of the group around it."""
+    """Yield the parameters of a group, under its class attribute `HEADING`, or else the heading of its outer group."""
     heading = getattr(group, "HEADING", heading)
     for field, declared in settings_in(group):
         if declared is None:
@@ -248,7 +248,7 @@ def _parameters(group: type[Any], heading: str) -> Iterator[click.Parameter]:
 
 
 def values_of(ctx: click.Context, kind: type[Options]) -> Options:
-    """Return a group of options with the values of a command line."""
+    """Return a group of options with the values given on the command line."""
     values: dict[str, Any] = {}
     for field, declared in settings_in(kind):
         if declared is None:
@@ -268,7 +268,7 @@ MAX_SIDE, DIGITS = 1 << 16, 6
 
 
 class _Number(click.ParamType):
-    """A number of a range; unlike click's, it fits into arrays and is not NaN."""
+    """Number in a range that, unlike click's, fits into arrays and is not NaN."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         number = super().convert(value, param, ctx)
@@ -280,15 +280,15 @@ class _Number(click.ParamType):
 
 
 class Whole(_Number, click.IntRange):
-    """An integer of a range."""
+    """Integer in a range."""
 
 
 class Real(_Number, click.FloatRange):
-    """A number of a range."""
+    """Number in a range."""
 
 
 class Choice(click.Choice):
-    """One of the values of a `Setting` that are no texts."""
+    """Choice among the values of a `Setting` that are not strings."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         text = super().convert(str(value), param, ctx)
@@ -297,7 +297,7 @@ class Choice(click.Choice):
 
 
 class Text(click.ParamType):
-    """A text that the `Quantity` of a `Setting` parses."""
+    """Text that is parsed by the `Quantity` of a `Setting`."""
 
     name = "text"
 
@@ -319,6 +319,7 @@ class Text(click.ParamType):
 
 
 def _numbers(text: str, names: str = "x,y,z") -> tuple[float, ...]:
+    """Parse finite numbers with commas between, as many as there are names."""
     count = names.count(",") + 1
     try:
         numbers = tuple(float(part) for part in text.split(","))
@@ -330,7 +331,7 @@ def _numbers(text: str, names: str = "x,y,z") -> tuple[float, ...]:
 
 
 def _direction(text: str) -> tuple[float, ...]:
-    """Parse an axis by its name (y, -y, ...), or x,y,z."""
+    """Parse a direction: the name of an axis, such as -y, or x,y,z."""
     if text.removeprefix("-") not in ("x", "y", "z"):
         numbers = _numbers(text)
         if not any(numbers):
@@ -347,7 +348,7 @@ def _ball(text: str) -> tuple[tuple[float, ...], float]:
 
 
 def _color(text: str) -> tuple[float, ...] | None:
-    """Parse a colour as (red, green, blue), 0..1; None for none."""
+    """Parse a colour as (red, green, blue), 0..1; None for transparent."""
     if text.lower() in COLORS:
         return COLORS[text.lower()]
     digits = text[1:]

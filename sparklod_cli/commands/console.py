@@ -41,18 +41,18 @@ LOG_INTERVAL = 10
 
 @dataclass
 class Verbosity:
-    """Whether -v was given: `cli.run` reads it where a command has failed and its context is gone."""
+    """Whether -v was given; `cli.run` reads it after a command has failed."""
 
     verbose: bool = False
 
 
 def rows(name: str, text: str) -> list[str]:
-    """Return the lines of a row of a report: a name and a text, which goes on below where it is longer than a line."""
+    """Return the lines of a row of a report: a name, and a text that is continued below if it is too long."""
     return _wrapped(f"  {name:<{NAMES - 3}} {printable(text, MOST)}".rstrip(), WIDTH, NAMES)
 
 
 def _wrapped(line: str, width: int, indent: int) -> list[str]:
-    """Break a line between words, but not after a number or a colon."""
+    """Break a line at blanks, except after a number or a colon."""
     if len(line) <= width:
         return [line]
     import re
@@ -64,17 +64,17 @@ def _wrapped(line: str, width: int, indent: int) -> list[str]:
 
 
 def is_terminal(stream: TextIO | None) -> bool:
-    """Return whether a stream is a terminal; one that is closed is None."""
+    """Return whether a stream is a terminal; None is a closed stream."""
     return stream is not None and stream.isatty()
 
 
 def say(text: str) -> None:
-    """Print one line on standard error unless that is closed, shortened and without control characters."""
+    """Print one line on standard error, shortened and without control characters."""
     _echo(printable(text, MOST))
 
 
 def print_json(record: dict[str, Any], *, indent: int | None = None) -> None:
-    """Print the result of a command on standard output as one JSON object, which begins with the schema version."""
+    """Print a result on standard output as one JSON object that begins with the schema version."""
     click.echo(json.dumps({"schema_version": JSON_VERSION} | record, indent=indent, allow_nan=False))
 
 
@@ -97,7 +97,7 @@ def say_usage_error(error: click.ClickException) -> None:
 
 
 def _meant(error: click.NoSuchOption) -> str:
-    """Return a hint: replacement, value of that name (--quality), the commands that have it, or a similar option."""
+    """Return a hint on an unknown option: its replacement, an option with such a value, other commands, or a typo."""
     ctx, flag = error.ctx, error.option_name
     if ctx is None:
         return ""
@@ -125,7 +125,7 @@ def for_screen(pieces: Iterable[bytes]) -> Iterator[bytes]:
 
 
 def _echo(text: str) -> None:
-    """Print a line on standard error; work goes on where that is closed, gone or full."""
+    """Print a line on standard error; ignore that it is closed or full."""
     try:
         click.echo(text, err=True)
     except OSError:
@@ -133,10 +133,9 @@ def _echo(text: str) -> None:
 
 
 class Console(contextlib.AbstractContextManager["Console"]):
-    """Prints lines on standard error, and the progress of each stage of work: a bar on a terminal, lines in a log.
+    """Messages and progress on standard error: a bar on a terminal, lines in a log; a context manager.
 
-    Used as a context manager, which clears the bar. With `verbose` it prints details. Its `progress` is a
-    `system.progress.Progress`.
+    `progress` is a `system.progress.Progress`.
     """
 
     def __init__(self, *, quiet: bool, verbose: bool) -> None:
@@ -144,7 +143,7 @@ class Console(contextlib.AbstractContextManager["Console"]):
         self._bars = not quiet and is_terminal(sys.stderr)
         self._bar: Any = None
         self._stage, self._start, self._logged = "", 0.0, 0.0
-        #: Begin and share of each stage of a job, 0 to 1, and how much of the job is done, which never falls.
+        #: Begin and share of each stage of a job, and the part of the job that is done, 0 to 1; it never falls.
         self._job: dict[str, tuple[float, float]] | None = None
         self._reached = 0.0
         #: Durations of compilations, and the process that compiles ahead.
@@ -170,7 +169,7 @@ class Console(contextlib.AbstractContextManager["Console"]):
         say_error(text)
 
     def say(self, text: str) -> None:
-        """Print a line; on a terminal, one that is too long is broken between words."""
+        """Print a line, broken between words where a terminal is too narrow."""
         if not self._quiet:
             self.clear()
             try:
@@ -206,6 +205,7 @@ class Console(contextlib.AbstractContextManager["Console"]):
             self._job, self._stage = None, ""
 
     def progress(self, stage: str, done: int, total: int, unit: str) -> None:
+        """Update the bar, or print a line for the log every `LOG_INTERVAL` seconds."""
         now = monotonic()
         if self._job is not None:
             begin, share = self._job.get(stage, (0.0, 0.0))
@@ -225,7 +225,7 @@ class Console(contextlib.AbstractContextManager["Console"]):
                 self.say(f"{stage}: {amount} ({100 * done / total:.0f} %), {format_duration(lasted)}")
 
     def _draw(self, stage: str, done: int, total: int, unit: str) -> None:
-        """Draw the bar of a stage, or of a job with the time left at the rate so far."""
+        """Draw the bar of a stage, or of a job with the estimated time left."""
         bar = self._bar
         if self._job is None:
             if bar is None or bar.desc != stage:
@@ -249,10 +249,10 @@ class Console(contextlib.AbstractContextManager["Console"]):
         return self._bar
 
     def announce_compiling(self, work: str | BakeSettings | None = None) -> None:
-        """Announce the first kernel that is compiled, show which one it is, and print at the end how long all took.
+        """Report the compilation of kernels from now on, and at the end how long it took.
 
-        A problem with the cache concerns every kernel, and is printed once. A second process compiles the kernels of
-        `work`, a bake or one of `warmup.JOBS`, meanwhile.
+        When the first one is compiled, a second process begins to compile the kernels of `work`, a bake or one of
+        `warmup.JOBS`.
         """
         from ..system import jit
 

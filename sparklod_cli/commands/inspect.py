@@ -60,7 +60,7 @@ def _print_schema(ctx: click.Context, param: click.Parameter, value: bool) -> No
 
 @dataclass(frozen=True)
 class Checks:
-    """Options of what files are checked for."""
+    """Options of the checks of files."""
 
     HEADING: ClassVar[str] = "Checks"
 
@@ -109,7 +109,7 @@ class Checks:
 
 @dataclass(frozen=True)
 class InspectOutput:
-    """Options of what is printed and drawn."""
+    """Options of reports and pictures."""
 
     HEADING: ClassVar[str] = "Report"
 
@@ -214,7 +214,7 @@ def inspect(ctx: click.Context, /, **_: Any) -> None:
 def _report_settings(
     checks: Checks, output: InspectOutput, expected: list[Assertion] | None, *, as_json: bool
 ) -> ReportSettings:
-    """Return what must be known of each file for what is printed, drawn and checked."""
+    """Return the parts of a report that are printed, drawn or checked."""
     from ..inspection.report import HEADER_FIELDS, ReportSettings
 
     field = output.field or ""
@@ -299,7 +299,7 @@ class _Job:
         return status
 
     def _report(self, name: str, report: Report) -> int:
-        """Print what the options ask for; return the exit status."""
+        """Print the report, findings or a value, as the options choose; return the exit status."""
         console, options, checks, output = self.console, self.options, self.options.checks, self.options.output
         is_read, findings = report.format is not None, report.findings or []
         status = CHECK_FAILED if checks.holds and report.fails(checks.fail_on) else 0
@@ -366,7 +366,7 @@ MOST_DEPTHS = 64
 
 
 def lines(name: str, report: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of a report on a file, given as its JSON."""
+    """Yield the lines of a report, given as JSON, for people."""
     from ..model.scene import up_note
 
     tree, values = report["tree"], report["values"]

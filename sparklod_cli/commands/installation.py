@@ -168,7 +168,7 @@ def _extras() -> Iterator[Check]:
 
 
 def _print_kernels() -> None:
-    """Import everything that a bake needs, and print the state of the kernels as JSON."""
+    """Import all modules of a bake, and print the state of the kernels as JSON."""
     from .. import warmup
     from ..bake.flow import bake  # noqa: F401
     from ..system import jit
@@ -297,7 +297,7 @@ def _programs() -> Iterator[Check]:
 
 
 def _optional(name: str, value: str, advice: str) -> Check:
-    """Return the check of something optional, a note if there is advice."""
+    """Return the check of an optional part, a note if there is advice."""
     return Check(name, "note" if advice else "ok", value, advice)
 
 
@@ -308,7 +308,7 @@ def _is_installed(package: str) -> bool:
 
 
 def _run(command: list[str]) -> tuple[int, str, str]:
-    """Return the exit status of a program, its output, and the last line of its errors, or else how it ended."""
+    """Return the exit status of a program, its output, and the last line of its errors or else its end."""
     try:
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False, timeout=PATIENCE)
     except subprocess.TimeoutExpired:
@@ -473,7 +473,7 @@ def _program(shell: str) -> str:
 
 
 def _install(shell: str) -> None:
-    """Append the line that loads the script to the settings of a shell, unless they have it."""
+    """Append the line that loads the script to the settings of a shell, unless it is there."""
     variable, folder, name, line = SHELLS[shell]
     line = line.format(program=_program(shell))
     path = Path(os.environ.get(variable) or Path.home() / folder) / name

@@ -74,10 +74,10 @@ def table_output(
     flag: str = "--output",
     form: str | None = None,
 ) -> TableOutput:
-    """Return the destination of a table, with its format by --format, or else by the name of the output.
+    """Return the output of a table, in the format of --format, or else of its name; CSV without a name.
 
-    Without an output, the table is CSV on standard output. It is not written (form None) where an object goes there
-    with --json, and on a terminal, where it would scroll by and the summary is printed instead.
+    Without an output, the table goes to standard output, but is not written (form None) with --json, or to a terminal,
+    which gets the summary.
     """
     from ..tables.columns import FORMS, TableOutput
 
@@ -101,7 +101,7 @@ def table_output(
 
 
 def report_outcomes(console: Console, outcomes: Sequence[Outcome], places: Iterable[str] = itertools.repeat("")) -> int:
-    """Print the outcomes of assertions, each with where it is; return the exit status."""
+    """Print the outcomes of assertions, each followed by its place; return the exit status."""
     for outcome, place in zip(outcomes, places):  # noqa: B905  # places may be endless
         if outcome.held:
             console.detail(f"  holds: {outcome.message()}{place}")
@@ -111,7 +111,7 @@ def report_outcomes(console: Console, outcomes: Sequence[Outcome], places: Itera
 
 
 def parse_asserts(texts: Sequence[str], columns: Sequence[Column]) -> list[Assertion]:
-    """Parse the values of --assert; raise a `click.UsageError` for one that cannot be understood."""
+    """Parse the values of --assert; raise a `click.UsageError` for an invalid one."""
     if not texts:
         return []
     from ..tables.assertions import BadAssertionError, parse

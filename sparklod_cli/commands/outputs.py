@@ -1,4 +1,4 @@
-"""Paths of commands: their parameters, what the name of an output says, and the check that no input is replaced."""
+"""Paths of commands: their parameters, names of outputs, and the check that no output replaces an input."""
 
 from __future__ import annotations
 
@@ -19,24 +19,27 @@ from .rules import flag_of
 
 INPUT, OUTPUT = "an input", "an output"
 
-#: Why no output is named after standard input, and what to do.
+#: Error for an output that would be named after standard input.
 NAMELESS = "standard input has no name to derive one from; name the output file"
 
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder given as an output file: the file is written into it, as cp and mv do."""
+    """Folder given as an output: the file is written into it, as cp and mv do."""
 
     path: Place
 
 
 class NamedPath(click.Path):
-    """A file or folder that a command reads or, if `output`, writes; with `stdin` also -, which is standard input.
+    """Path of a file or, with `folder`, a folder that a command reads or writes.
 
-    Whether it can be opened is checked later, so that a bad file does not stop the others. With `folder`, the command
-    fills a folder. An output file may be given as a `Folder`: a name that ends in a slash, or an existing folder.
-    `suffixes` are those of the formats that it can have: `keep_apart` refuses others. With `addresses`, it may also be
-    s3://bucket/file and the like.
+    It is opened later, so that a bad file does not stop the others. A name of an output file that ends in a slash, or
+    is an existing folder, becomes a `Folder`.
+
+    Args:
+        suffixes: the only ones that `keep_apart` allows; empty for any.
+        addresses: allow s3://bucket/file and the like.
+        stdin: allow -, which is standard input.
     """
 
     def __init__(
@@ -72,10 +75,9 @@ class NamedPath(click.Path):
 
 
 def name_outputs(ctx: click.Context, source: Place | None, ending: str = "") -> None:
-    """Replace each parameter that is a `Folder` by the path of the file in it, which is named after an input.
+    """Replace each parameter that is a `Folder` by a file in it, named after an input; None if there is no input.
 
-    Without an input, which other checks report, do nothing. The name ends in `ending`, or else in the suffix of the
-    parameter, of --format or of the first format of tables.
+    The name ends in `ending`, or else in the suffix of the parameter, of --format or of the first format of tables.
     """
     from ..tables.columns import FORMS as TABLES
 
@@ -91,9 +93,9 @@ def name_outputs(ctx: click.Context, source: Place | None, ending: str = "") -> 
 
 
 def require_suffix(flag: str, output: Place, endings: Iterable[str]) -> None:
-    """Raise a `click.UsageError` where the name of an output has no suffix, which would choose its format.
+    """Raise a `click.UsageError` if the name of an output has no suffix to choose its format.
 
-    Standard output, pipes and devices need none. `endings` are the possible suffixes and names of files.
+    Standard output, pipes and devices need no suffix. `endings` are the possible suffixes and names.
     """
     if output == DASH or output.suffix or _is_stream(_status(output)):
         return
@@ -104,11 +106,12 @@ def require_suffix(flag: str, output: Place, endings: Iterable[str]) -> None:
 
 
 def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | None = None) -> None:
-    """Raise a `click.UsageError` if an output of a command is also an input or another output of it.
+    """Raise a `click.UsageError` if an output is also an input or another output, or has a wrong suffix.
 
-    Also if the suffix of an output is that of another format than the written one. Files themselves are compared, so
-    that links and other spellings of a name do not matter. Pipes and devices are never replaced. `stands_for` has, by
-    the name of a parameter, further files: the files that an input names, and the files written into a folder.
+    Files are compared, not names, so that links and spellings do not matter. Pipes and devices are never replaced.
+
+    Args:
+        stands_for: by parameter, the files that an input names, or that are written for an output.
     """
     stands_for = stands_for or {}
     inputs: list[Place] = []
@@ -157,7 +160,7 @@ def keep_apart(ctx: click.Context, stands_for: Mapping[str, Iterable[Place]] | N
 
 
 def is_same_place(one: Place, other: Place) -> bool:
-    """Return whether two paths are of the same file, whatever links and spellings lead there."""
+    """Return whether two paths lead to the same file, by links or other spellings."""
     if DASH in (one, other):
         return False
     statuses = _status(one), _status(other)
@@ -165,7 +168,7 @@ def is_same_place(one: Place, other: Place) -> bool:
 
 
 def _status(path: Place) -> os.stat_result | None:
-    """Return the status of a file; None if it does not exist, or is at an address."""
+    """Return the status of a file; None for a missing file or an address."""
     if isinstance(path, Address):
         return None
     try:
@@ -179,27 +182,19 @@ def _is_stream(status: os.stat_result | None) -> bool:
 
 
 def _place(path: Place) -> str:
-    """Return the path of a file that exists or not: the same for all links and spellings. Or its address."""
+    """Return a text that is the same for all links to a file, which need not exist, and all spellings of its path."""
     if isinstance(path, Address):
         return path.url
     place = Path(os.path.realpath(path))
     folder, other = place.parent, place.parent.name.swapcase()
     with contextlib.suppress(OSError, ValueError):
-        # A folder that can be found by its name in the other case ignores the case of names.
+        # The folder also found by its name in the other case is on a file system that ignores case.
         if other != folder.name and folder.samefile(folder.with_name(other)):
             return str(folder / place.name.casefold())
     return str(place)
 
 
 def stem_of(source: Place) -> str:
-    """Return the stem of the names of outputs: that of the input, or of its folder where it is an unpacked SOG."""
+    """Return the stem for names of outputs: that of the input, or the name of its folder for a meta.json and such."""
     whole = source if isinstance(source, Address) else source.absolute()
     return whole.parent.name if source.name in (META, MANIFEST, TILESET) else whole.stem or whole.name
-
-
-def file_of(text: str) -> Path | None:
-    """Return the file that the text of an option names; None if no such file exists."""
-    try:
-        return Path(text) if Path(text).is_file() else None
-    except (OSError, ValueError):
-        return None

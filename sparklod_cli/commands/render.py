@@ -65,7 +65,7 @@ MOST_SIDE = {"webp": 16_383, "jpg": 65_500}
 
 @dataclass(frozen=True)
 class PictureCameras(Cameras):
-    """Options of the cameras of pictures: without a source there is one camera, and there is `--view`."""
+    """Options of the cameras of pictures, with `--view`; the default is one camera."""
 
     orbit: int | None = common(f"{AROUND_SCENE}one camera that sees the whole scene]", CAMERAS)
     views: tuple[Any, ...] = setting(
@@ -119,7 +119,7 @@ class Appearance:
     )
 
     def settings(self, say: Callable[[str], None]) -> RenderSettings:
-        """Return the settings of pictures with the options of the backend; `say` receives a line on the device."""
+        """Return the settings of pictures, with options of the backend; `say` receives a line about the device."""
         options = {"sorting": self.sorting, "throttle": self.sort_throttle}
         known = {name: value for name, value in options.items() if value is not None}
         device = "cuda" if self.render.device != "cpu" and uses_card(self.render.device, say) else "cpu"
@@ -149,10 +149,7 @@ HEADINGS = (*(COMMON, "Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming"), 
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options of the command: those of its files, and groups of others.
-
-    The output is a file, a name with a place for a number, a folder for files named after the input, or -.
-    """
+    """Options of render. The output is a file, a name with a place for a number, a folder, or -."""
 
     HEADING: ClassVar[str] = "Output"
 
@@ -262,7 +259,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
     look, general = options.appearance, options.general
     budget = None if options.cut.full else options.cut.one_budget()
     instances = options.inputs.instances()
-    # What is wrong with the output is said before much is read: least is the number of cameras known until then.
+    # Errors of the output come before files are read, when only the least number of cameras is known.
     cameras = options.cameras
     if cameras.views:
         least = len(cameras.views)
@@ -279,7 +276,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
             console.say(question)
         console.announce_compiling("pictures")
         lod, render = options.cut.settings(), look.settings(console.say)
-        # What looks at more than cuts is read whole.
+        # Full detail, blending and colours of whole scenes need whole files.
         paged = budget is not None and lod.continuous is None and render.color_by in (None, *COLORS_OF_CUTS)
         scenes = scenes_of(options.cut, options.general, instances, console, through=look.through, paged=paged)
         path, diff = options.cameras.path(scenes), options.diff
@@ -310,7 +307,7 @@ def _draw(ctx: click.Context, options: RenderOptions) -> None:
 
 
 def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> PictureOutput:
-    """Return the output of the pictures of some cameras; one without a name goes beside the first input."""
+    """Return the output of the pictures of a number of cameras; without a name it is beside the first input."""
     from ..images.picture_files import output_for
 
     first = options.inputs.scene or options.inputs.files[0]
@@ -332,7 +329,7 @@ def _output(ctx: click.Context, options: RenderOptions, cameras: int) -> Picture
 def _place(
     ctx: click.Context, options: RenderOptions, instances: list[Instance], path: CameraPath
 ) -> tuple[PictureOutput, PictureSettings]:
-    """Return the output of the pictures of a path, and how they become files; refuse it before work goes into it."""
+    """Return the output of the pictures of a path, and the settings of its files, both checked before the work."""
     from ..images.picture_files import WITH_ALPHA
     from ..images.pixels import check_animation, scale_width
     from ..images.sequence import PictureSettings, frame_rate
@@ -480,7 +477,7 @@ def _compare(ctx: click.Context, options: RenderOptions) -> int:
 
 
 def _lines(summary: Sequence[BudgetSummary], path: CameraPath, leaves: int) -> Iterator[str]:
-    """Yield the summary as a person reads it; with popping where frames follow each other."""
+    """Yield the lines of the summary, with popping if frames follow each other."""
     sizes = list(dict.fromkeys((camera.width, camera.height) for camera in path.cameras))
     size = f"{sizes[0][0]} x {sizes[0][1]}" + (" and others" if len(sizes) > 1 else "")
     yield f"  {count_of(len(path.cameras), 'frame')} of {size}, against {count_of(leaves, 'splat')}, on black and white"

@@ -17,7 +17,7 @@ from .console import is_terminal
 
 
 class Rule(NamedTuple):
-    """A row: options that a command refuses, each on its own.
+    """Row of the table: options that a command refuses, each on its own, under some conditions.
 
     Attributes:
         commands, options: names of commands, and of the parameters that the row is about.
@@ -115,12 +115,7 @@ RULES = (
         only_for=("place=file", "place=standard output"),
         why="makes one file of all inputs; name it with --output",
     ),
-    Rule(
-        BUILD,
-        ("skip_existing",),
-        excludes=("place=standard output",),
-        why="needs an output that can be there already; name a file",
-    ),
+    Rule(BUILD, ("skip_existing",), excludes=("place=standard output",), why="needs an output file; name one"),
     Rule(FITS, ("rgba",), only_for=("count=1",), why="takes one input, not {count}"),
     Rule(INSPECT, ("plot", "chunks_out"), only_for=("count=1",), why="takes one file, not {count}"),
     Rule(
@@ -138,12 +133,7 @@ RULES = (
     Rule(FITS, ("seed", "device"), needs=("refine",)),
     Rule(FITS, ("camera_path",), needs=("psnr", "refine")),
     Rule(BUILD, ("scratch_dir", "resume"), excludes=("refine",), why=", which needs the whole tree in memory"),
-    Rule(
-        SIMPLIFY,
-        GOALS,
-        excludes=GOALS,
-        why="and {other} cannot be used together; give one of --to, --max-bytes and --psnr",
-    ),
+    Rule(SIMPLIFY, GOALS, excludes=GOALS, why="and {other} cannot be used together; give one of them"),
     Rule(SIMPLIFY, ("max_bytes",), excludes=("refine",)),
     # Formats
     Rule(BAKES, ("spz_version", "fractional_bits"), only_for=("format=SPZ",)),
@@ -186,15 +176,8 @@ RULES = (
         INSPECT,
         ("stats",),
         needs=("as_json",),
-        when=("check",),
-        why="cannot be used with --check unless --json is given",
-    ),
-    Rule(
-        INSPECT,
-        ("stats",),
-        needs=("as_json",),
-        when=EXPECTATIONS,
-        why="cannot be used with expectations unless --json is given",
+        when=("check", *EXPECTATIONS),
+        why="cannot be used with --check or expectations unless --json is given",
     ),
     Rule(INSPECT, ("style", "fail_on"), needs=("check", *EXPECTATIONS), why="needs --check or an expectation"),
     Rule(INSPECT, ("plot_level", "plot_by"), needs=("plot", "html"), why="needs --plot or --html"),
@@ -203,14 +186,7 @@ RULES = (
         TRAVERSE,
         ("form", "per_instance", "no_timing"),
         excludes=("table=none",),
-        when=("as_json",),
-        why="cannot be used with --json without --output, which writes no table",
-    ),
-    Rule(
-        TRAVERSE,
-        ("form", "per_instance", "no_timing"),
-        excludes=("table=none",),
-        why="is of the table, and a terminal gets the summary; redirect it, or add --output",
+        why="is of the table, and --json and terminals get the summary; redirect it, or add --output",
     ),
     # Pictures
     Rule(RENDER, NOT_COMPARED, excludes=("compare",)),
@@ -284,14 +260,14 @@ RULES = (
 
 
 def check(ctx: click.Context, **facts: Any) -> None:
-    """Raise a `click.UsageError` where options contradict each other, or the facts that are known so far."""
+    """Raise a `click.UsageError` if options contradict each other, or the facts known so far."""
     values = {**ctx.params, "stdout": "terminal" if is_terminal(sys.stdout) else "file", **facts}
     for rule in RULES:
         if ctx.command.name not in rule.commands or (rule.when and not _holding(ctx, rule.when, values)):
             continue
         if rule.only_for and rule.only_for[0].partition("=")[0] not in facts:
             continue
-        for name in filter(lambda name: is_given(ctx, name), rule.options):
+        for name in _holding(ctx, rule.options, values):
             others = [each for each in _holding(ctx, rule.excludes, values) if each != name]
             required = rule.needs or rule.only_for
             if others or (required and not _holding(ctx, required, values)):
@@ -301,7 +277,7 @@ def check(ctx: click.Context, **facts: Any) -> None:
 
 
 def _usual(ctx: click.Context, rule: Rule, others: list[str], values: Mapping[str, Any]) -> str:
-    """Return the words after the flag in the message of most rows."""
+    """Return the usual words after the flag: what it cannot, or can only, be used with, or whose option it is."""
     if rule.only_for:
         fact = rule.only_for[0].partition("=")[0]
         known = " and ".join(each.partition("=")[2] for each in rule.only_for)
@@ -315,23 +291,18 @@ def _usual(ctx: click.Context, rule: Rule, others: list[str], values: Mapping[st
 
 
 def _holding(ctx: click.Context, conditions: Iterable[str], values: Mapping[str, Any]) -> list[str]:
-    """Return the conditions that hold."""
+    """Return the conditions that hold; an option given as None, such as a transparent background, does not."""
     parts = ((each, *each.partition("=")) for each in conditions)
     return [
         each
         for each, name, equals, value in parts
-        if (name in values and str(values[name]) == value if equals else is_given(ctx, name))
+        if (name in values and str(values[name]) == value if equals else is_set(ctx, name) and values[name] is not None)
     ]
 
 
 def is_set(ctx: click.Context, name: str) -> bool:
     """Return whether a parameter was given, even with its default value."""
     return ctx.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
-
-
-def is_given(ctx: click.Context, name: str) -> bool:
-    """Return whether a parameter was given, and means something: transparent is no background."""
-    return is_set(ctx, name) and ctx.params[name] is not None
 
 
 def flag_of(ctx: click.Context, name: str) -> str:

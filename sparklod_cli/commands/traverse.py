@@ -48,7 +48,7 @@ EXAMPLES = """\
 
 @dataclass(frozen=True)
 class TraverseOptions:
-    """Options of the command: those of its outputs, and groups of others."""
+    """Options of traverse."""
 
     HEADING: ClassVar[str] = "Output"
 
@@ -172,7 +172,7 @@ def traverse(ctx: click.Context, /, **_: Any) -> None:
             ctx.exit(report_outcomes(console, outcomes))
 
 
-#: Names of the quantities, and how a number of each is printed.
+#: Names of the quantities, and the style of their numbers, see `_said`.
 QUANTITIES = {
     "selected": ("splats drawn", "count"),
     "budget_used": ("budget used", "share"),
@@ -188,7 +188,7 @@ QUANTITIES = {
     "traverse_ms": ("traversal", "ms"),
 }
 
-#: Reasons to look at a frame, and its value.
+#: Texts of the criteria by which frames stand out, and the style of their values.
 MOMENTS = {
     "churn": ("{} of the splats pop", "share"),
     "bytes": ("{} are fetched", "bytes"),
@@ -196,6 +196,16 @@ MOMENTS = {
     "missing": ("splats drawn too coarse: {}", "count"),
     "incomplete": ("{} until it is complete", "seconds"),
     "overdraw": ("{} splats cover a pixel", "fixed"),
+}
+
+#: Styles of numbers, but for bytes, which are written by `format_size`.
+STYLES = {
+    "count": "{:,.0f}",
+    "share": "{:.1f} %",
+    "seconds": "{:.2f} s",
+    "ms": "{:.2f} ms",
+    "fixed": "{:.1f}",
+    "plain": "{:.4g}",
 }
 
 STOPS = {
@@ -237,7 +247,7 @@ def lines(summary: Summary) -> Iterator[str]:
 
 
 def _loading(figures: Row) -> str:
-    """Return a phrase on the waiting times of a visitor who opens the page in front of the first camera."""
+    """Return the waiting times of a visitor who opens the page at the first camera."""
     parts = []
     for label, name in (("first picture", "first_picture"), ("90 %", "resident_90"), ("all", "resident_all")):
         seconds, size = figures[f"{name}_s"], figures.get(f"{name}_bytes")
@@ -247,14 +257,6 @@ def _loading(figures: Row) -> str:
 
 
 def _said(value: float, style: str) -> str:
-    if style == "count":
-        return f"{round(value):,}"
-    if style == "share":
-        return f"{100 * value:.1f} %"
     if style == "bytes":
         return format_size(round(value)) if value else "0"
-    if style == "seconds":
-        return f"{value:.2f} s"
-    if style == "ms":
-        return f"{value:.2f} ms"
-    return f"{value:.1f}" if style == "fixed" else f"{value:.4g}"
+    return STYLES[style].format(100 * value if style == "share" else value)

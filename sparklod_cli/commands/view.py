@@ -39,7 +39,7 @@ EXAMPLES = """\
 
 @dataclass(frozen=True)
 class _Page:
-    """Options of what the page shows at first, and what it is made of."""
+    """Options of the page: its first view and its source files."""
 
     HEADING: ClassVar[str] = "Page"
 
@@ -64,7 +64,7 @@ class _Page:
 
 @dataclass(frozen=True)
 class _Place:
-    """Options of where the page is served, or written."""
+    """Options of the server, or of the folder that the page is written to."""
 
     HEADING: ClassVar[str] = "Server"
 

@@ -1,9 +1,10 @@
-"""Options of commands that show scenes: cameras, files and cuts."""
+"""Options of traverse and render: cameras, files and cuts."""
 
 from __future__ import annotations
 
 import functools
 import math
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from ..viewers.viewer_settings import BLEND, FACTOR, PLAYCANVAS_BUDGET, PRESETS,
 from .command import DIRECTION, POINT, SIZE, VIEW, VIEWS, common, flag
 from .console import Console
 from .option_groups import DEFAULT_UP, UP, General
-from .outputs import NamedPath, file_of
+from .outputs import NamedPath
 from .rules import check, is_set
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 # Cameras and cuts
 
-#: Sources of cameras whose coordinates are given, so that nothing about them is chosen for the scene.
+#: Sources of cameras with given coordinates, which do not depend on the scene.
 FIXED = ("camera_path", "look_at", "views", "keyframes")
 
 #: Characters of a --world-transform given as numbers; any other text names a file.
@@ -49,7 +50,7 @@ CAMERAS = whole(1, 1 << 20)
 
 @dataclass(frozen=True)
 class Cameras:
-    """Values of the options of cameras; None for those not given."""
+    """Options of cameras; None where not given."""
 
     HEADING: ClassVar[str] = "Cameras"
 
@@ -111,11 +112,11 @@ class Cameras:
     every: int = setting("Take every K-th camera of the path.", whole(1, unit="K"), 1)
     views: tuple[Any, ...] = ()  # an option of pictures alone
 
-    #: Without a source there is one camera that sees the whole scene, in place of an orbit.
+    #: Whether the default is one camera that sees the whole scene, instead of an orbit.
     still: ClassVar[bool] = False
 
     def path(self, scenes: Callable[[], Scenes]) -> CameraPath:
-        """Return the cameras; scenes are read only where cameras are chosen for them, or need their up axis."""
+        """Return the cameras; calls `scenes` only if cameras are placed by the scenes or need their up axis."""
         from ..cameras import sources
         from ..cameras.camera import DEFAULT_SECONDS, Settings
 
@@ -154,7 +155,7 @@ class Cameras:
 
 
 def _world(value: str) -> Matrix:
-    """Return the (4, 4) matrix of --world-transform, which is a text of numbers or names a file."""
+    """Return the (4, 4) matrix of --world-transform: numbers, or the name of a file."""
     from ..cameras.camera_files import read_world_transform, similarity
 
     if "," in value and not set(value) - NUMERIC:
@@ -175,7 +176,7 @@ PRIORITY = "of 1, which is that of nodes in the middle"
 
 @dataclass(frozen=True)
 class Inputs:
-    """The splat files, each an instance; or an instances file, which names them."""
+    """Options of the splat files, or of the instances file that lists them."""
 
     HEADING: ClassVar[str] = "Inputs"
 
@@ -185,7 +186,7 @@ class Inputs:
     )
 
     def instances(self) -> list[Instance]:
-        """Return the instances: each FILE once, untransformed, or those of the instances file."""
+        """Return the instances of the instances file, or one of each FILE, untransformed."""
         from ..model.instances import instances_of
 
         if not self.files and self.scene is None:
@@ -203,7 +204,7 @@ MOST_DRAWN = "Largest number of splats to draw, such as 500k, or a share of the 
 
 @dataclass(frozen=True)
 class CutOptions:
-    """Options of the cuts of trees, and of how detail levels of Streamed SOG are chosen."""
+    """Options of the cuts of trees, and of the choice of detail levels of Streamed SOG."""
 
     HEADING: ClassVar[str] = "Cut"
 
@@ -264,6 +265,7 @@ class CutOptions:
         return scaled
 
     def settings(self) -> LodSettings:
+        """Return the settings of cuts, with foveation by cones or by the frustum."""
         behind = self.behind_foveate
         if self.outside_foveate is not None:
             foveation: Foveation = Frustum(self.outside_foveate, 1.0 if behind is None else behind)
@@ -277,7 +279,7 @@ class CutOptions:
 def scenes_of(
     cut: CutOptions, general: General, instances: Sequence[Instance], console: Console, **how: Any
 ) -> Callable[[], Scenes]:
-    """Return a function that reads the scenes of instances when it is first called; `how` are further arguments."""
+    """Return a function that reads the scenes of instances once, when first called; `how` goes to `read_scenes`."""
     from ..viewers.scenes import read_scenes
 
     how |= {"precision": cut.precision, "threads": general.threads, "progress": console.progress}
@@ -285,10 +287,10 @@ def scenes_of(
 
 
 def files_read(cameras: Cameras, instances: list[Instance]) -> dict[str, list[Path]]:
-    """For `keep_apart`: by the name of an option, the files that it names without being one."""
+    """Return files that are inputs because another file or option names them, by option, for `keep_apart`."""
     splats = [each.source for each in instances if isinstance(each.source, Path)]
-    matrix = cameras.world_transform and file_of(cameras.world_transform)
-    return {"scene": splats, "world_transform": [matrix] if matrix else []}
+    matrix = Path(cameras.world_transform or "")
+    return {"scene": splats, "world_transform": [matrix] if os.path.isfile(matrix) else []}  # noqa: PTH113
 
 
 def check_view(
@@ -300,7 +302,7 @@ def check_view(
     network: Network | None = None,
     notes: Iterable[str] = (),
 ) -> None:
-    """Print notes on the cameras, further ones, and those on scenes; refuse options for other kinds of files."""
+    """Refuse options that do not apply to the kind of the files, and print notes on cameras and scenes."""
     from ..model.scene import up_notes_of
     from ..viewers.loaded_scene import TREE
 
@@ -321,9 +323,9 @@ def check_view(
 def with_planes(
     ctx: click.Context, cameras: Cameras, render: RenderSettings, path: CameraPath, scenes: Callable[[], Scenes]
 ) -> RenderSettings:
-    """Return settings whose near and far planes enclose the scenes, where the distance is chosen for them, too.
+    """Move the near and far planes so that a view of the whole scene clips nothing.
 
-    So a view of the whole scene clips nothing. Planes that were given stay.
+    Planes stay if they, the distance or the cameras were given.
     """
     fixed = cameras.distance is not None or any(getattr(cameras, name) for name in FIXED)
     if fixed or any(is_set(ctx, name) for name in ("near", "far")):

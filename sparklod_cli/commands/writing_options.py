@@ -133,7 +133,7 @@ def check_outputs(
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """Options of which splats of the input are kept, and how the scene is turned, scaled and moved."""
+    """Options that select splats of the input, and rotate, scale and move the scene."""
 
     min_opacity: float = common("Leave out splats whose opacity is lower than this.", Range(0, 1, unit="N"), 0.0)
     within: Any = common("Leave out splats whose centre is outside this ball, in the input's coordinates.", BALL)
@@ -176,13 +176,13 @@ class SceneOptions:
     )
 
 
-#: Parameters without an effect on an input that has a tree, of any command.
+#: Parameters of all commands that have no effect on an input with a tree.
 _BUILT = ("method", "max_sh", *(builder.setting for builder in BUILDERS.values()))
 OF_TREES = (*_BUILT, *(each.name for each in dataclasses.fields(SceneOptions)), "environment_beyond")
 
 
 class OptionalNumber(click.IntRange):
-    """A number that may be left out; `zero` is a text for 0, which may be out of the range."""
+    """Number that may be left out; the text `zero` means 0, even outside the range."""
 
     def __init__(self, range: Range, *, placeholder: str = "N", example: int, zero: str = "") -> None:
         super().__init__(range.least, range.most)  # type: ignore[arg-type]  # whole numbers
@@ -203,7 +203,7 @@ class OptionalNumber(click.IntRange):
 
 @dataclass(frozen=True)
 class Writing:
-    """Options of each command that writes scenes: of the splats, of the format and of messages."""
+    """Options of all commands that write scenes: selection, position, file format, and messages."""
 
     max_sh: int = common("Highest degree of spherical harmonics to keep.", whole(0, MAX_SH_DEGREE), MAX_SH_DEGREE)
     scene: SceneOptions = field(default_factory=SceneOptions)
@@ -221,7 +221,7 @@ class Writing:
     general: General = field(default_factory=General)
 
     def settings(self, ctx: click.Context, form: Form, **more: Any) -> BakeSettings:
-        """Return the settings of a bake or conversion, `more` among them; loads numpy."""
+        """Return the settings of a bake or conversion, with further ones in `more`; loads numpy."""
         from ..bake.settings import BakeSettings
         from ..model.selection import Selection
 

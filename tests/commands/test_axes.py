@@ -8,15 +8,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pytest
 
 import sparklod_cli as sparklod
 from fixtures import by_hand_glb, by_hand_tiles
 from sparklod_cli.api.sites import prepare
-from sparklod_cli.cli import COMMANDS
-from sparklod_cli.cli import cli as program
 from sparklod_cli.codecs import spz
 from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.images.metrics import psnr
@@ -176,15 +173,6 @@ def test_a_turned_instance_has_another_axis(folder: Path, cli: Cli) -> None:
     assert up_of("x.rad") == "-y"
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_up_is_in_the_short_help_of_every_command_that_has_it(name: str, cli: Cli) -> None:
-    command = program.get_command(click.Context(program), name)
-    assert command is not None
-    has_it = any(parameter.name == "up" for parameter in command.params)
-    assert has_it == (name in ("build-lod", "convert", "simplify", "render", "traverse", "view"))
-    assert (" --up " in cli(f"{name} --help").out) == has_it
-
-
 # --- Outputs of sparklod ----------------------------------------------------------------------------------------------
 
 #: Outputs in every format of trees, turned so that y is up, and their options.
@@ -242,14 +230,6 @@ def test_orbits_go_around_the_axis_that_is_up(turned: Cli) -> None:
         assert camera.camera_to_world[1, 1] < 0  # y is down, or no axis is up in both, as training leaves scenes
 
 
-@pytest.mark.parametrize("suffix", ["spz", "rad"])
-def test_without_up_no_axis_is_noted(suffix: str, cli: Cli) -> None:
-    for options in ("", "--rotate 90,0,0", "--translate 1,2,3"):
-        cli(f"build-lod sh2.ply -o x.{suffix} -f {options}")
-        assert b'"up"' not in Path(f"x.{suffix}").read_bytes()[:4096]
-        assert cli(f"inspect x.{suffix} --json").json["up"] is None
-
-
 @pytest.mark.parametrize(
     ("options", "up"),
     [
@@ -279,12 +259,6 @@ def test_every_output_has_the_axis_of_its_input(turned: Cli) -> None:
     err = turned("convert a.rad x.splat").err
     assert re.search("y is up, which this format cannot note; give --up=y to render", err)
     assert "--up" not in turned("convert a.rad x.ply").err
-
-
-def test_leaves_of_an_unknown_axis_keep_it(folder: Path, cli: Cli) -> None:
-    for line in ("convert {} x.spz --leaves", "simplify {} --to 90% -o x.spz -f"):
-        cli(line.format(folder / "tree.rad"))
-        assert up_of("x.spz") is None and not is_upright(cli, "x.spz")
 
 
 @pytest.mark.parametrize("name", AXES)

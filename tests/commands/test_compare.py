@@ -25,7 +25,6 @@ from sparklod_cli.lod.budget import parse_budgets
 from sparklod_cli.model.foveation import Cones
 from sparklod_cli.model.instances import Instance
 from sparklod_cli.render.render_settings import RenderSettings
-from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.tables.columns import Row
 from sparklod_cli.viewers.scenes import Scenes, read_scenes
 from sparklod_cli.viewers.viewer_settings import LodSettings
@@ -148,19 +147,6 @@ def test_a_change_of_the_cut_pops_by_what_it_changes(twice: Scenes) -> None:
     assert by_hand > 1
 
 
-def test_summaries_leave_empty_cells_out(twice: Scenes) -> None:
-    table = list(Comparison(twice, LOD, parse_budgets("10%,50%"), RENDER).run(film(3, 0.05)))
-    for at, each in enumerate(summarize(table, ["10%", "50%"])):
-        values = column(table[at::2], "popping")[1:]
-        assert (each.popping, each.popping_max) == (pytest.approx(np.mean(values)), max(values))
-        assert each.popping_frame == 1 + values.index(max(values))
-        assert each.edge_psnr == pytest.approx(np.mean(column(table[at::2], "edge_psnr")))
-        assert each.edge_psnr_min == min(column(table[at::2], "edge_psnr"))
-    empty = [row | {"popping": None, "edge_psnr": None} for row in table]
-    for each in summarize(empty, ["10%", "50%"]):
-        assert each.popping is each.popping_max is each.popping_frame is each.edge_psnr is each.edge_psnr_min is None
-
-
 def test_threads_do_not_change_a_comparison(twice: Scenes) -> None:
     assert rows(twice, "10%,50%", threads=1) == rows(twice, "10%,50%", threads=3)
     assert popped(twice, "10%,50%", film(5, 0.05)) == popped(twice, "10%,50%", film(5, 0.05), threads=3)
@@ -170,24 +156,6 @@ def test_spherical_harmonics_can_be_left_out(twice: Scenes) -> None:
     plain = dataclasses.replace(RENDER, max_sh=0)
     assert rows(twice, "100%", count=1, render=plain)[0]["psnr"] == MOST_PSNR
     assert rows(twice, "10%", count=1, render=plain) != rows(twice, "10%", count=1)
-
-
-def test_a_pixel_limit_ends_cuts_early(twice: Scenes) -> None:
-    coarse = Comparison(twice, dataclasses.replace(LOD, pixel_scale_limit=0.3), parse_budgets("100%"), RENDER)
-    (row,) = coarse.run(path_of(1))
-    assert row["selected"] < row["budget"]  # type: ignore[operator]
-    assert row["psnr"] < 60  # type: ignore[operator]
-
-
-def test_a_budget_smaller_than_the_number_of_instances_is_refused(twice: Scenes) -> None:
-    with pytest.raises(SparklodError, match="a budget of 1 is less than one splat for each of 2 instances"):
-        Comparison(twice, LOD, parse_budgets("50%,1"), RENDER)
-
-
-def test_a_picture_lies_over_its_background_and_is_clamped() -> None:
-    image = np.array([[[0.2, 0.1, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0], [1.2, 0.5, 0.5, 1.0]]], np.float32)
-    np.testing.assert_allclose(on_background(image, 0.0), [[[0.2, 0.1, 0], [0, 0, 0], [1, 0.5, 0.5]]], atol=1e-7)
-    np.testing.assert_allclose(on_background(image, 1.0), [[[0.7, 0.6, 0.5], [1, 1, 1], [1, 0.5, 0.5]]], atol=1e-7)
 
 
 def test_summaries_are_by_budget(twice: Scenes) -> None:

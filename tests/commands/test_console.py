@@ -30,8 +30,7 @@ from sparklod_cli.lod import quick
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.system.errors import OutOfMemoryError, memory_errors_translated, out_of_memory
-from sparklod_cli.system.threads import ordered_map
+from sparklod_cli.system.errors import out_of_memory
 from tests.commands.cli import NAMED, Cli
 from tests.conftest import ROOT
 from tests.scenes import random_splats
@@ -427,15 +426,6 @@ def test_a_file_too_large_for_memory_does_not_stop_the_others(cli: Cli, monkeypa
         first, second = cli(line, status=1).err.splitlines()
         assert first.startswith(f"error: {line.split()[1]}: it does not fit into memory")
         assert not second.startswith("error")
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_memory_that_runs_out_in_a_thread_is_an_out_of_memory_error(threads: int) -> None:
-    def work(size: int) -> int:
-        return len(np.empty(size, np.uint8))
-
-    with pytest.raises(OutOfMemoryError, match="1,000,000,000,000,000 numbers"), memory_errors_translated():
-        list(ordered_map(work, [1, 10**15, 2], threads))
 
 
 def test_every_way_in_which_memory_runs_out_is_recognised() -> None:

@@ -171,30 +171,9 @@ def test_what_splat_cannot_hold_is_reported(cli: Cli) -> None:
     assert f"SPLAT holds no reflections (SH), and clamps the colours of {100 * beyond / len(rgb):.3g} % of" in err
 
 
-@pytest.mark.parametrize("name", ["a.sog", "web/meta.json"])
-def test_sog_holds_all_leaves(name: str, tree_cli: Cli) -> None:
-    tree_cli(f"convert tree.spz {name} --cluster-sh 3000")
-    scene, expected = read_scene(Path(name)), leaves("tree.spz")
-    assert (scene.format, scene.antialiased, scene.header["palette"]) == ("SOG 2", True, 3000)
-    for column in ("rgb", "opacity", "sh"):
-        one, two = (np.sort(getattr(each, column), axis=0) for each in (scene.splats, expected))
-        np.testing.assert_allclose(one, two, atol=0.01)
-    np.testing.assert_allclose(scene.splats.center.mean(axis=0), expected.center.mean(axis=0), atol=1e-4)
-
-
 def test_leaves_that_cannot_be_drawn_are_written_too(cli: Cli) -> None:
     splats = random_splats(50)
     splats.opacity[:10] = 1e-4  # becomes 0 in the file
     cli.put("tree.spz", b"".join(spz.encode(Scene(*quick.build(splats)))))
     cli("convert tree.spz a.spz --leaves")
     assert len(leaves("a.spz")) == 50
-
-
-def test_leaves_of_a_rad_are_written_to_every_container(cli: Cli) -> None:
-    cli("build-lod sh2.ply -o tree.rad")
-    expected = leaves("tree.rad")
-    for name, options in (("a.rad", "--leaves"), ("a.spz", "--leaves"), ("many.rad", "--leaves --format rad-chunked")):
-        cli(f"convert tree.rad {name} {options}")
-        scene = read_scene(Path(name))
-        assert scene.tree is None and scene.header.get("chunked", 0) == (name == "many.rad")
-        np.testing.assert_allclose(scene.splats.center, expected.center, atol=1e-3)

@@ -23,7 +23,7 @@ from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import Splats
 from sparklod_cli.system.errors import SparklodError
-from tests.commands.cli import NAMED, Cli, process
+from tests.commands.cli import NAMED, Cli
 
 #: A tree of nine nodes, of which six are leaves; a scene without a tree; files with one error, warning and note.
 TREE, PLAIN = "hand-tree-v3.spz", "sh2.ply"
@@ -145,12 +145,6 @@ def test_a_field_missing_in_one_file_does_not_stop_the_others(cli: Cli) -> None:
     assert cli(f"inspect {BROKEN} --check --field splats", status=3).out == "10\n"
     done = cli(f"inspect {PLAIN} {TREE} --field tree.leaves", status=1)
     assert done.out == "6\n" and re.match(f"error: {PLAIN}: .*the report has no tree.leaves", done.err)
-
-
-def test_a_process_prints_findings_and_exits_3() -> None:
-    done = process("inspect --check", NAMED[BROKEN], NAMED[TREE], text=True)
-    assert (done.returncode, done.stdout.count("\n")) == (3, 1)
-    assert done.stderr.endswith(": OK: 9 nodes, no problems found\n") and "Traceback" not in done.stderr
 
 
 def test_every_finding_is_an_annotation_for_github(cli: Cli) -> None:

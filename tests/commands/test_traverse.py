@@ -121,7 +121,7 @@ def test_a_terminal_gets_the_summary_and_the_table_by_output_alone(cli: Cli, mon
         done = cli(f"traverse {TOWN} {ORBIT} {quiet}")
         assert "splats drawn" in done.out and "frame,time_s" not in done.out and "splats drawn" not in done.err
     for option in ("--format csv", "--per-instance", "--no-timing"):
-        said = f"{option.split()[0]} is of the table, and a terminal gets the summary; redirect"
+        said = f"{option.split()[0]} is of the table, and --json and terminals get the summary; redirect"
         assert said in cli(f"traverse {TOWN} {ORBIT} {option}", status=2).err
         assert len({row["frame"] for row in cli(f"traverse {TOWN} {ORBIT} {option} -o -").rows}) == 3
     assert cli(f"traverse {TOWN} {ORBIT} --no-summary")[1:] == ("", "")
@@ -172,15 +172,6 @@ def test_instances_have_names_and_places_of_their_own(cli: Cli) -> None:
     assert [row["instance"] for row in rows] == ["total", "near", "tree-v3"]
     total, near, far = (int(row["selected"]) for row in rows)
     assert near > far and total == near + far
-
-
-def test_an_instances_file_is_checked(cli: Cli) -> None:
-    put_scene(cli, {"file": "gone.spz"})
-    said = f"error: {cli.folder / 'gone.spz'}: cannot be read: no such file or directory\n"
-    assert cli("traverse --scene scene.json", status=1).err in (said, said.replace(f"{cli.folder}/", ""))
-    put_scene(cli, {"file": "a"}, {"file": "b", "scale": "big"})
-    said = "scene.json: instances[1].scale: expected a number up to 1e+12, not 'big'"
-    assert said in cli("traverse --scene scene.json", status=1).err
 
 
 def test_a_walk_through_a_city_has_a_row_for_every_instance_and_frame(cli: Cli) -> None:
