@@ -1,6 +1,6 @@
 """Identity of a bake: its inputs and settings, which determine the bytes of its output.
 
-`--skip-existing`, `--resume` and scratch folders compare it.
+Bakes with `--skip-existing` or `--resume` compare it with that of an earlier bake.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from ..system.stdio import DASH, name_of
 from ..system.untrusted import quoted_value
 from .settings import BakeSettings
 
-#: Settings that are not part of an identity: `files` are inputs, and bakes with the others are not skipped or resumed.
+#: Settings outside of an identity: `files` are inputs, and the others occur in no bake that is skipped or resumed.
 NO_PART = ("unused", "simplify", "rgba", "environment", "camera_path")
 
-#: Setting under which an identity has the version of the program.
+#: Name of the version of the program among the settings of an identity.
 PROGRAM = "sparklod"
 
 #: Samples of a file, and bytes of each: 4 MB of a large file, which takes milliseconds. Chosen.
@@ -45,7 +45,7 @@ class FileState:
     Attributes:
         modified: nanoseconds since 1970; 0 for standard input and at an address.
         sample: digest of bytes from all over the file; at an address, of its version.
-        content: digest of all bytes; empty if they were not read.
+        content: digest of all bytes; empty if it was not computed.
     """
 
     name: str
@@ -56,7 +56,7 @@ class FileState:
 
     @classmethod
     def of(cls, path: Place) -> FileState:
-        """Examine a file without reading much of it; raise `UnreadableError` if it cannot be read."""
+        """Examine a file by a sample of its bytes; raise `UnreadableError` if it cannot be read."""
         digest = _digest()
         if isinstance(path, Address):
             with readable():
@@ -73,7 +73,7 @@ class FileState:
 
     @property
     def key(self) -> str:
-        """Text that differs for files whose contents differ."""
+        """Text that identifies the contents of the file."""
         return self.content or f"{self.bytes} {self.modified} {self.sample}"
 
 
@@ -82,8 +82,8 @@ class BakeIdentity:
     """Inputs and settings of a bake.
 
     Attributes:
-        inputs: in the order in which they are read; their names do not matter.
-        settings: by name, as "selection.min_opacity"; the version of the program, too.
+        inputs: in the order of reading; their names do not matter.
+        settings: by name, as "selection.min_opacity", and the version of the program.
     """
 
     inputs: tuple[FileState, ...]
@@ -97,7 +97,7 @@ class BakeIdentity:
 
         Args:
             whole: read all of each input for a digest of its content.
-            former: identity whose digests are taken over for inputs of the same size, date and sample.
+            former: earlier identity, whose digests are kept for inputs of the same size, date and sample.
         """
         known = {} if former is None else {dataclasses.replace(each, content=""): each for each in former.inputs}
         files = [(file, "") for place in places_of(source) for file in files_of(place)]
@@ -122,7 +122,7 @@ class BakeIdentity:
 
     @classmethod
     def from_record(cls, record: Any) -> BakeIdentity:
-        """Read an identity from its record, `dataclasses.asdict`; raise `ValueError` for any other value."""
+        """Read an identity from the result of `dataclasses.asdict`; raise `ValueError` for any other value."""
         try:
             return cls(tuple(FileState(**each) for each in record["inputs"]), dict(record["settings"]))
         except (KeyError, TypeError) as error:
@@ -130,13 +130,13 @@ class BakeIdentity:
 
     @property
     def digest(self) -> str:
-        """32 characters that no other identity has."""
+        """Digest of the identity, 32 characters."""
         digest = _digest()
         digest.update(json.dumps([[each.key for each in self.inputs], self.settings], sort_keys=True).encode())
         return digest.hexdigest()
 
     def differences(self, former: BakeIdentity) -> list[str]:
-        """Return the differences from a former identity in words; empty without any."""
+        """Describe the differences from a former identity; empty without any."""
         found = []
         if len(self.inputs) != len(former.inputs):
             found.append(f"it had {len(former.inputs)} input files and has {len(self.inputs)}")
@@ -150,11 +150,10 @@ class BakeIdentity:
 
 
 def files_of(path: Place, sets: Collection[Collection[str]] = ()) -> list[Place]:
-    """Return a file and those that it names, or the files of an unpacked or a Streamed SOG.
+    """Return a file and the files that it names, or the files of a folder such as an unpacked or a Streamed SOG.
 
     Args:
-        path: file or folder.
-        sets: names of files that belong together if some of them exist, as for `read_together`.
+        sets: names of files that belong together, as for `read_together`.
     """
     if path == DASH or isinstance(path, Address):
         return [path]
@@ -163,7 +162,7 @@ def files_of(path: Place, sets: Collection[Collection[str]] = ()) -> list[Place]
 
 
 def content_of(path: Place) -> str:
-    """Return a digest of all bytes of a file, about 0.5 GB a second."""
+    """Compute the digest of all bytes of a file, about 0.5 GB a second."""
     digest = _digest()
     with readable(), file_of(path) as file:
         while piece := file.read(_READ_BYTES):
@@ -176,6 +175,7 @@ def _digest() -> hashlib.blake2b:
 
 
 def _flat(name: str, value: Any) -> Iterable[tuple[str, Any]]:
+    """Yield nested settings with their names, as "selection.min_opacity", and values for JSON."""
     if dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             yield from _flat(f"{name}.{field.name}" if name else field.name, getattr(value, field.name))

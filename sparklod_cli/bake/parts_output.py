@@ -1,4 +1,4 @@
-"""Outputs in parts that viewers load as needed: a Streamed SOG of regions at several levels, and 3D Tiles."""
+"""Outputs in parts that viewers load as needed: Streamed SOG, with errors of its detail levels, and 3D Tiles."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from ..system.threads import on_threads
 
 @dataclass(frozen=True)
 class WrittenLevel:
-    """Detail level of a Streamed SOG: splats of all regions, their share of level 0, and the largest error."""
+    """Detail level of a Streamed SOG: splats of all regions, their share of level 0, and largest error of a region."""
 
     splats: int
     share: float
@@ -40,7 +40,7 @@ class WrittenLevel:
 
 @dataclass(frozen=True)
 class WrittenDetail:
-    """Detail levels of a Streamed SOG.
+    """Record of a Streamed SOG.
 
     Attributes:
         levels: full detail first.
@@ -56,12 +56,12 @@ class WrittenDetail:
 
 @dataclass(frozen=True)
 class WrittenTiles:
-    """Tiles of a tileset.
+    """Record of 3D Tiles.
 
     Attributes:
-        splats: of each level's cut, the root's first; the last has full detail.
+        splats: number in the cut of each level, from the root to full detail.
         error: geometric error of the root.
-        georeferenced: the tileset stands on the Earth.
+        georeferenced: the tileset has a position on the Earth.
     """
 
     tiles: int
@@ -81,10 +81,10 @@ def write_levels(
     threads: int,
     progress: Progress,
 ) -> tuple[int, WrittenDetail]:
-    """Make the levels of a tree and write them as a Streamed SOG; return the bytes of its files, and their record.
+    """Make the detail levels of a tree and write them as a Streamed SOG; return the bytes of its files, and a record.
 
     Args:
-        end: called with the name of each stage before the last one, when it is done.
+        end: called with the name of each stage but the last, when it is done.
     """
     from ..codecs.streamed_sog import encode_files
     from ..lod.parts import make_levels
@@ -140,11 +140,11 @@ def write_tiles(
 
 Errors = NDArray[np.float64]
 
-#: Rotation w x y z of the viewing axes, used in both directions: 45, 20 and 35 degrees about x, y and z, as in
-#: splat-transform 3.7. Along the world's axes many spherical harmonics are 0, which would hide their errors.
+#: Rotation w x y z of the viewing axes, 45, 20 and 35 degrees about x, y and z as in splat-transform 3.7: along the
+#: world's axes many spherical harmonics are 0, which would hide their errors.
 TURN = (0.8877160, 0.3111847, 0.2663317, 0.2102186)
 
-#: Signs of the axes of a camera that looks back, if two of its axes are exchanged.
+#: Signs of the axes of a camera that looks in the opposite direction, after two of its axes are exchanged.
 BACK = np.array([[1.0], [1.0], [-1.0]])
 
 #: Distance of the camera from the middle of a region, and half the width of the picture there, in radii of the region,
@@ -160,23 +160,19 @@ LEAST_WIDTH, MOST_WIDTH = 64, 128
 #: Pixels across the diameter of a small splat: the FINE quantile of a region by the longest axis.
 PIXELS, FINE = 4, 0.1
 
-#: Splats of a region that this quantile is estimated from.
-SAMPLE = 4096
-
-#: Splats whose pictures are drawn between two reports of progress.
-BATCH = 1 << 21
+#: Splats of a region from which this quantile is estimated; and splats drawn between two reports of progress.
+SAMPLE, BATCH = 4096, 1 << 21
 
 
 def measured(scene: DetailScene, *, threads: int | None = None, progress: Progress = silent) -> Errors:
-    """Return the (R, L) float64 error of each region at each detail level, measured on pictures.
+    """Measure the (R, L) float64 error of each region at each detail level on pictures.
 
-    The method of splat-transform 3.7, whose numbers can be compared: each region is drawn alone from six directions,
-    from so far away that there is hardly any perspective. An error is the squared difference from the pictures of the
-    first level, of colours premultiplied by alpha and of alpha, divided by the squares of those: independent of the
-    size and place of the region. See benchmarks/notes/rounding-and-levels.md.
+    As in splat-transform 3.7, each region is drawn alone from six directions, from so far away that there is hardly any
+    perspective. The error is the sum of squared differences from the pictures of the first level, in premultiplied
+    colours and alpha, over the sum of squares of those: independent of the size and place of the region. See
+    benchmarks/notes/rounding-and-levels.md.
 
-    It is 0 at the first level of a region, does not decrease, and does not depend on the number of threads. A missing
-    level has the error of the level before.
+    It is 0 at the first level of a region and does not decrease. A missing level has the error of the level before.
     """
     order = np.argsort(scene.counts == 0, axis=1, kind="stable")  # levels that have splats come first
     runs = np.take_along_axis(np.stack([scene.starts, scene.counts], 2), order[:, :, None], 1)

@@ -1,4 +1,4 @@
-"""Workspace of a bake out of core: the decision for it, the scratch folder with its lock, and the engine."""
+"""Decision to bake out of core, and the scratch folder with its lock, which holds the results meanwhile."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .built_tree import BuiltTree
 from .identity import BakeIdentity
 from .in_blocks import InBlocks
 from .job import Engine, Job, LocalEngine, forget
-from .settings import BakeSettings, Resources
+from .settings import Resources
 from .store import Store
 
 #: Folder in the scratch folder for the unpacked input.
@@ -51,7 +51,7 @@ def blocks_for(
     engine: Engine | None,
     say: Callable[[str], None],
 ) -> Iterator[InBlocks | None]:
-    """Open the workspace of a bake that goes out of core, if that is needed or requested; None for one in memory.
+    """Prepare a bake that must or shall go out of core, and yield it; yield None for a bake in memory.
 
     Args:
         header: of the input, without a tree.
@@ -59,15 +59,39 @@ def blocks_for(
 
     Raises:
         ScratchError: the scratch folder cannot be used, or has too little room.
-        FormatError, OutOfMemoryError: as `flow.bake`.
+        FormatError: as `flow.bake`.
+        OutOfMemoryError: as `flow.bake`; or the output is made of a whole tree, which memory cannot hold.
     """
     name, settings = name_of(source), tree.settings
     identity = BakeIdentity.of(source, settings)  # reports a missing file before the bake begins
     memory = estimate.default_memory() if resources.memory is None else resources.memory
     store = Store(folder if engine is None else absolute(folder))  # other processes have working folders of their own
     is_left = bool(store.names())
-    whole = _needs_whole_tree(settings)
-    why = _reason(header, settings, resources, memory, engine, whole, is_left=is_left)
+    wholes = {
+        "--refine fits a whole tree": settings.refine,
+        "a simplified scene is a cut of a whole tree": settings.simplify,
+        "tiles are made of a whole tree": settings.tiles,
+        "detail levels are made of a whole tree": settings.detail,
+    }
+    whole = next((reason for reason, setting in wholes.items() if setting is not None), None)
+    why = None  # the bake goes out of core
+    needed = estimate.in_memory_bytes(settings, header.count, header.sh_degree)
+    if memory is not None and needed > memory:
+        if whole is not None:
+            most = estimate.most_in_memory(memory, settings, header.sh_degree)
+            raise OutOfMemoryError(
+                f"{whole}, not in blocks: {count_of(header.count, 'splat')} would take about"
+                f" {format_size(needed)} of memory, and {format_size(memory)} are enough for {most:,}; give --memory"
+                f" {megabytes(estimate.ENOUGH * needed)} or more if the machine has it, or fewer splats"
+            )
+        allowed = "may take" if resources.memory is None else "--memory gives it"
+        why = f"it would take about {format_size(needed)} of memory and {allowed} {format_size(memory)}"
+    elif engine is not None:
+        why = "a cluster was requested"
+    elif resources.resume and is_left:
+        why = "the interrupted bake did"
+    elif resources.block_splats:
+        why = "blocks were requested"
     work = functools.partial(at_work, store, identity, resume=resources.resume, overwrite=overwrite, say=say)
     if why is not None and whole is not None:
         say(f"{name}: goes on in memory, although {why}: {whole}")
@@ -89,57 +113,14 @@ def blocks_for(
     )
     with work(block_splats) as block_splats, _opened(source, store.folder, threads, engine) as stream:
         settings = dataclasses.replace(settings, rgba=settings.rgba and settings.rgba.absolute())
-        assert tree.form is not None  # others need the whole tree
+        assert tree.form is not None  # other outputs need the whole tree
         job = Job(store, stream, settings, tree.form.codec().needed(tree.options), tree.in_chunks)
         windows = estimate.windows_within(memory, splats, degree, threads)
         yield InBlocks(job, engine or LocalEngine(threads), block_splats, windows, progress)
 
 
-def _reason(
-    header: Reader,
-    settings: BakeSettings,
-    resources: Resources,
-    memory: int | None,
-    engine: Engine | None,
-    whole: str | None,
-    *,
-    is_left: bool,
-) -> str | None:
-    """Return why a bake goes out of core, as the end of a sentence; None for one in memory.
-
-    Raise `OutOfMemoryError` if it would, but its output is made of a whole tree.
-    """
-    needed = estimate.in_memory_bytes(settings, header.count, header.sh_degree)
-    if memory is not None and needed > memory:
-        if whole is not None:
-            most = estimate.most_in_memory(memory, settings, header.sh_degree)
-            raise OutOfMemoryError(
-                f"{whole}, not in blocks: {count_of(header.count, 'splat')} would take about"
-                f" {format_size(needed)} of memory, and {format_size(memory)} are enough for {most:,}; give --memory"
-                f" {megabytes(estimate.ENOUGH * needed)} or more if the machine has it, or fewer splats"
-            )
-        allowed = "may take" if resources.memory is None else "--memory gives it"
-        return f"it would take about {format_size(needed)} of memory and {allowed} {format_size(memory)}"
-    if engine is not None:
-        return "a cluster was requested"
-    if resources.resume and is_left:
-        return "the interrupted bake did"
-    return "blocks were requested" if resources.block_splats else None
-
-
-def _needs_whole_tree(settings: BakeSettings) -> str | None:
-    """Return why an output is made in memory only, as the end of a sentence; None if it can be made in blocks."""
-    reasons = {
-        "--refine fits a whole tree": settings.refine,
-        "a simplified scene is a cut of a whole tree": settings.simplify,
-        "tiles are made of a whole tree": settings.tiles,
-        "detail levels are made of a whole tree": settings.detail,
-    }
-    return next((reason for reason, setting in reasons.items() if setting is not None), None)
-
-
 def _check_room(folder: Place, needed: int) -> None:
-    """Raise `ScratchError` if there is too little room for a scratch folder, which may already hold results."""
+    """Raise `ScratchError` if a scratch folder, which may already hold results, will not fit onto its disk."""
     if not isinstance(folder, Path):
         return
     nearest = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.is_dir())
@@ -154,7 +135,7 @@ def _check_room(folder: Place, needed: int) -> None:
 
 @contextlib.contextmanager
 def _opened(source: Source, folder: Place, threads: int, engine: Engine | None) -> Iterator[Reader]:
-    """Open the input such that other processes can read it, whatever their working folders."""
+    """Open the input so that processes with other working folders can read it."""
     unpacked = folder.absolute() / UNPACKED if isinstance(folder, Path) else None
     with contextlib.ExitStack() as stack:
         if unpacked is None and engine is not None:
@@ -167,11 +148,8 @@ def _opened(source: Source, folder: Place, threads: int, engine: Engine | None) 
         yield stack.enter_context(open_reader(absolute_source(source), scratch=unpacked, threads=threads))
 
 
-#: File that the running bake has locked.
-LOCK = "lock"
-
-#: Result with the identity of the bake, and its one array.
-MANIFEST = "manifest"
+#: File that the running bake has locked; and the result, and its array, with the identity of the bake.
+LOCK, MANIFEST = "lock", "manifest"
 
 #: Version of the names and contents of results; a bake of another version cannot be resumed.
 LAYOUT = 2
@@ -190,13 +168,13 @@ def at_work(
     overwrite: bool,
     say: Callable[[str], None],
 ) -> Iterator[int]:
-    """Lock a scratch folder for the tasks of a bake, and remove the folder at the end; yield the size of a block.
+    """Lock a scratch folder for the tasks of a bake, and remove it at the end; yield the size of a block.
 
-    The results stay after an interrupt, and after an error that another run need not meet. A resumed bake keeps its
-    size of blocks. `overwrite` removes the results of an earlier bake, unless `resume` is set.
+    The results stay after an interrupt, and after an error that another run may avoid. A resumed bake keeps its size of
+    blocks. `overwrite` removes the results of an earlier bake, unless `resume` is set.
 
     Raises:
-        ScratchError: another run is at work there; there are results and neither `resume` nor `overwrite` is set, or
+        ScratchError: another run uses the folder; there are results and neither `resume` nor `overwrite` is set, or
             they belong to another bake; or the store cannot be written.
     """
     folder = store.folder
@@ -253,7 +231,7 @@ def _read_manifest(store: Store) -> tuple[BakeIdentity, int] | None:
 
 
 def _clear(store: Store) -> None:
-    """Remove everything but the lock; the manifest last, for a run that is killed here."""
+    """Remove everything but the lock, and the manifest last, so that a killed run leaves no results without it."""
     folder = store.folder
     if isinstance(folder, Path):
         for path in sorted(folder.iterdir(), key=lambda path: (path.is_file(), path.name)):
@@ -267,7 +245,7 @@ def _clear(store: Store) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a folder for one run; it and its parents are created if missing, and removed at the end if empty."""
+    """Lock a folder for one run; create it and its parents, and remove those at the end that are empty."""
     path = folder / LOCK
     with contextlib.ExitStack() as stack:
         try:
@@ -281,15 +259,18 @@ def locked(folder: Path) -> Iterator[None]:
         try:
             yield
         finally:
+            if not HAS_LOCKS:  # Windows cannot remove an open file
+                os.close(descriptor)
+            with contextlib.suppress(OSError):
+                if [*folder.iterdir()] == [path]:
+                    path.unlink()
+                    folder.rmdir()
             if HAS_LOCKS:
-                _remove_empty(path)
-            os.close(descriptor)
-            if not HAS_LOCKS:  # Windows cannot remove a file that is open
-                _remove_empty(path)
+                os.close(descriptor)
 
 
 def _opened_lock(path: Path) -> int:
-    """Create and lock the file; raise `ScratchError` if another run has locked it, or the folder holds other files."""
+    """Create and lock the file; raise `ScratchError` if another run has locked it, or the folder has no results."""
     folder = path.parent
     with contextlib.suppress(FileNotFoundError):
         if not path.exists() and any(folder.iterdir()):
@@ -298,7 +279,7 @@ def _opened_lock(path: Path) -> int:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o666)
         is_free = lock(descriptor, wait=False)
-        with contextlib.suppress(FileNotFoundError):  # the run that had it was done, and removed it
+        with contextlib.suppress(FileNotFoundError):  # the run that had locked it has ended and removed it
             if os.path.samestat(os.fstat(descriptor), path.stat()):
                 if is_free:
                     return descriptor
@@ -307,11 +288,3 @@ def _opened_lock(path: Path) -> int:
                     f"another run is at work in {folder}; wait for it, or give this one another output or --scratch-dir"
                 )
         os.close(descriptor)
-
-
-def _remove_empty(path: Path) -> None:
-    """Remove a folder that holds only its lock."""
-    with contextlib.suppress(OSError):
-        if [*path.parent.iterdir()] == [path]:
-            path.unlink()
-            path.parent.rmdir()

@@ -1,7 +1,7 @@
 """Bakes that are skipped because their output exists: `--skip-existing`.
 
-A file beside the output, NAME.sparklod.json, has the identity of the bake, with a digest of each input, and a digest of
-each file of the output. Dates only save reading files that nobody has touched since; with `verify`, all are read.
+A file beside the output, NAME.sparklod.json, records the identity of the bake, with a digest of each input, and a
+digest of each output file. Files of the same size and date are not read again, except with `verify`.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from .flow import bake, has_published
 from .identity import BakeIdentity, content_of, files_of
 from .settings import Baked, BakeSettings, Resources
 
-#: Suffix of the file beside an output, and the largest size that is read.
+#: Suffix and largest size of the file beside an output.
 SUFFIX, MAX_BYTES = ".sparklod.json", 1 << 24
 
 
 def bake_unless_there(
     source: Source, target: Place, settings: BakeSettings, *, verify: bool = False, overwrite: bool = False, **how: Any
 ) -> Baked | None:
-    """Bake as `bake` does, and record the identity of the bake; None if the output of the same identity exists.
+    """Bake as `bake` does, and record the identity of the bake; return None if its output exists already.
 
     Args:
-        verify: read all of the inputs and of the output, also if their sizes and dates are those of the last bake.
+        verify: read all inputs and output files even if their sizes and dates are those of the last bake.
 
     Raises:
-        OutputError: the output exists, is not that of this bake, and `overwrite` is not set.
+        OutputError: the output exists and was made from other inputs or settings, and `overwrite` is not set.
         SparklodError: as `bake`.
     """
     note_path = target.parent / f"{target.name}{SUFFIX}"
     former, output = _read_note(note_path)
     if not target.exists():
-        check_writable(target, overwrite=overwrite)  # before all inputs are read
+        check_writable(target, overwrite=overwrite)  # before reading all inputs
     identity = BakeIdentity.of(source, settings, whole=True, former=None if verify else former)
     resources = how.get("resources") or Resources()
     is_resumed = resources.resume and has_published(source, target, settings, resources)
@@ -55,7 +55,7 @@ def bake_unless_there(
             raise OutputError(f"{target} exists, but {'; '.join(differences)}; add --overwrite to bake it again")
     note_output = Output(note_path, overwrite=True)
     try:
-        note_path.unlink(missing_ok=True)  # so that it never lies beside an output of another bake
+        note_path.unlink(missing_ok=True)  # so that it is never beside an output of another bake
     except OSError as error:
         raise OutputError(f"cannot replace {note_path}: {reason_of(error)}") from None
     baked = bake(source, target, settings, overwrite=overwrite, **how)
@@ -80,21 +80,20 @@ def _read_note(path: Place) -> tuple[BakeIdentity | None, dict[str, Any]]:
 
 
 def _changed_files(target: Place, records: dict[str, Any], *, verify: bool) -> list[str]:
+    """Describe each file that was added, removed or changed since the bake recorded it."""
     files = {_within(target, file): file for file in files_of(target)}
-    names = sorted({*files, *records})
-    changed = (name for name in names if not _is_same(files.get(name), records.get(name), verify=verify))
-    return [f"{name} was changed since it was baked" for name in changed]
 
+    def is_same(name: str) -> bool:
+        file, record = files.get(name), records.get(name)
+        if file is None or not isinstance(record, dict):
+            return False
+        try:
+            is_untouched = not verify and record.get("stamp") == _stamp_of(file)
+            return is_untouched or bool(record.get("content") == _record_of(file)["content"])
+        except UnreadableError:
+            return False
 
-def _is_same(file: Place | None, record: Any, *, verify: bool) -> bool:
-    if file is None or not isinstance(record, dict):
-        return False
-    try:
-        if not verify and record.get("stamp") == _stamp_of(file):
-            return True
-        return bool(record.get("content") == _record_of(file)["content"])
-    except UnreadableError:
-        return False
+    return [f"{name} was changed since it was baked" for name in sorted({*files, *records}) if not is_same(name)]
 
 
 def _record_of(file: Place) -> dict[str, str]:
@@ -103,7 +102,7 @@ def _record_of(file: Place) -> dict[str, str]:
 
 
 def _stamp_of(file: Place) -> str:
-    """Return size and date of a file, or its version at an address, which change when it is written."""
+    """Return size and date of a file, or the version at an address; both change when the file is written."""
     with readable():
         if isinstance(file, Address):
             return file.version()

@@ -1,4 +1,4 @@
-"""Outputs of scenes: which files stand beside the first one, and how a scene becomes files."""
+"""Outputs of scenes: the files beside the first one, and the encoding of a scene into files."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ _TILES_3D = Siblings(is_of_tileset, lambda name: name == TILES, TILES, _named_by
 
 
 def siblings_of(path: Place) -> Siblings:
-    """Return the names of the files beside a header: of its format's parts, images of a meta.json, or chunks of RAD."""
+    """Return the files that belong to a header: parts of its format, images of a meta.json, or chunks of RAD."""
     if path.name in (MANIFEST, TILESET):
         return _TILES_3D if path.name == TILESET else _STREAMED_SOG
     name = path.name if isinstance(path, Address) else Path(os.path.realpath(path)).name
@@ -76,14 +76,14 @@ def siblings_of(path: Place) -> Siblings:
 
 
 def parts_output(path: Place, *, overwrite: bool) -> Output:
-    """Return the output of a manifest and its folders; a manifest of an unknown name is that of a Streamed SOG."""
+    """Return the output of a manifest and its folders: 3D Tiles for a tileset.json, else a Streamed SOG."""
     return Output(path, overwrite=overwrite, siblings=_TILES_3D if path.name == TILESET else _STREAMED_SOG)
 
 
 def scene_output(path: Place, form: Format, *, chunked: bool = False, overwrite: bool) -> Output:
     """Return the output of a scene in a format; - is standard output.
 
-    The path is that of the header where the scene is in several files: as `form.unbundled`, or as `chunked` RAD.
+    If the scene becomes several files, as `form.unbundled` or `chunked` RAD, the path is that of the header.
     """
     several = chunked or path.name.lower() == form.unbundled
     return Output(path, overwrite=overwrite, siblings=siblings_of(path) if several else None)
@@ -92,7 +92,7 @@ def scene_output(path: Place, form: Format, *, chunked: bool = False, overwrite:
 def encoded(
     out: Output, form: Format, scene: Scene, options: WriteOptions, *, threads: int = 1, progress: Progress = silent
 ) -> Files:
-    """Return the files of a scene: one, a header and its chunks, or those of an unbundled format, as the output is."""
+    """Encode a scene as the files of an output: one, a header and chunks, or those of an unbundled format."""
     codec: Any = form.codec()
     name = out.target.name
     if out.siblings is None:
@@ -109,6 +109,6 @@ def encoded(
 def write_scene(
     out: Output, form: Format, scene: Scene, options: WriteOptions, *, threads: int = 1, progress: Progress = silent
 ) -> int:
-    """Write a scene to an output of `scene_output`, and return the number of bytes."""
+    """Write a scene to an output of `scene_output`, and return the size of all files in bytes."""
     with out:
         return sum(out.write(*file) for file in encoded(out, form, scene, options, threads=threads, progress=progress))
