@@ -335,12 +335,6 @@ def test_continuous_cuts_fade_what_the_weights_say() -> None:
     assert part.weight.sum() == pytest.approx(3000, rel=1e-3)
 
 
-def test_a_twin_with_another_budget_leaves_the_first_alone() -> None:
-    scenes = read_scenes(at(TOWN))
-    view, finder = seen(scenes), CutFinder(scenes, LodSettings(2000))
-    assert len(finder.with_budget(500).cut(view)) <= 500 < len(finder.cut(view)) <= 2000
-
-
 def test_through_an_encoding_splats_are_rounded_and_the_cut_stays() -> None:
     scenes = {through: read_scenes(at(TOWN), through=through) for through in (None, "packed", "ext", "spz")}
     finders = {through: CutFinder(each, LodSettings(2000)) for through, each in scenes.items()}
@@ -441,13 +435,6 @@ def test_a_cut_is_one_level_of_each_region_and_the_environment(row: DetailScene,
     np.testing.assert_array_equal(cut.splats.center, every.take(index).center)
 
 
-def test_full_detail_of_regions_is_level_0_and_the_environment(row: DetailScene) -> None:
-    scenes = scenes_of(row)
-    np.testing.assert_array_equal(scenes.full().splats.center, row.scene().splats.center)
-    assert len(CutFinder(scenes, None).cut(AT)) == scenes.leaves == 6 * 64 + 5
-    assert len(CutFinder(scenes, LodSettings()).candidates()) == 6 * 112 + 5
-
-
 def test_budgets_are_shares_of_full_detail_or_the_default_of_playcanvas(row: DetailScene) -> None:
     scenes = scenes_of(row)
     assert scenes.splats_of(parse_budget("50%")) == (6 * 64 + 5) // 2
@@ -530,10 +517,3 @@ def test_files_are_read_with_the_bytes_of_their_chunks(row: DetailScene, tmp_pat
         sizes = [sum(each.stat().st_size for each in (manifest.parent / name).iterdir()) for name in folders]
         assert [sum(each) for each in loaded.requests] == sizes and loaded.bytes == sum(sizes) + manifest.stat().st_size
         np.testing.assert_array_equal(loaded.detail.counts, row.counts)
-
-
-def test_a_manifest_that_names_a_missing_file_is_refused_by_its_name(row: DetailScene, tmp_path: Path) -> None:
-    manifest = write_streamed(tmp_path, row)
-    (tmp_path / "1_0" / "meta.json").unlink()
-    with pytest.raises(FormatError, match=r"lod-meta\.json: .*1_0/meta\.json"):
-        read_scenes([Instance(manifest, "row")])

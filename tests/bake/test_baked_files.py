@@ -9,7 +9,6 @@ import contextlib
 import functools
 import itertools
 import json
-import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -23,13 +22,10 @@ from hypothesis import strategies as st
 import sparklod_cli as sparklod
 from fixtures import by_hand, by_hand_ksplat, by_hand_splat
 from sparklod_cli.api.converting import convert_file
-from sparklod_cli.bake.built_tree import BuiltTree, output_of, select, write_windows
 from sparklod_cli.bake.flow import bake, stage_shares
-from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
+from sparklod_cli.bake.settings import BakeSettings, Resources
 from sparklod_cli.bake.simplifying import SimplifyGoal
-from sparklod_cli.codecs import encoder as encoding
 from sparklod_cli.codecs import ply, spz
-from sparklod_cli.codecs.encoder import windows_of
 from sparklod_cli.codecs.formats import (
     ENCODINGS,
     MAX_FRACTIONAL_BITS,
@@ -40,29 +36,24 @@ from sparklod_cli.codecs.formats import (
     WriteOptions,
 )
 from sparklod_cli.codecs.rad import rad_writer as rad_options
-from sparklod_cli.codecs.reader import Reader
 from sparklod_cli.codecs.spark_codings import log_scale_table
-from sparklod_cli.codecs.statistics import Statistics
 from sparklod_cli.fitting.fit_settings import FitSettings
 from sparklod_cli.inspection import leaves, values
 from sparklod_cli.inspection.findings import ERROR, NOTE, Finding
 from sparklod_cli.inspection.report import ReportSettings, inspect
 from sparklod_cli.io.reading import read_scene
-from sparklod_cli.lod import quick
 from sparklod_cli.lod.budget import parse_budget
 from sparklod_cli.lod.chunk_order import viewpoints
 from sparklod_cli.lod.tree_settings import METHODS, DetailSettings, TileSettings
 from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
-from sparklod_cli.model.selection import Selection, SelectionTally
+from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.sh import COEFFICIENTS
 from sparklod_cli.model.splats import Splats
-from sparklod_cli.system.errors import InvalidSplatsError, OutputError, SparklodError
-from sparklod_cli.system.progress import silent
+from sparklod_cli.system.errors import SparklodError
 from sparklod_cli.tables import histograms
 from tests.conftest import FIXTURES, real_scene
-from tests.lod.trees import hard_cases
-from tests.scenes import node_stream, random_splats, splat_columns
+from tests.scenes import random_splats, splat_columns
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -338,26 +329,6 @@ def test_bakes_of_random_scenes_pass_the_check_for_ci(count: int, seed: int, ext
         check_for_ci(file_of(folder, random_splats(count, seed=seed, extent=extent)), method)
 
 
-@pytest.mark.parametrize("name", hard_cases())
-def test_splats_that_can_be_drawn_are_selected_unchanged(name: str) -> None:
-    splats = hard_cases()[name]
-    assert select(splats, BakeSettings()) == (splats, SelectionTally(len(splats)))
-
-
-def test_selections_of_blocks_add_up_to_that_of_the_scene() -> None:
-    splats = random_splats(50)
-    splats.scale[4] = 0
-    settings = BakeSettings(selection=Selection(min_opacity=float(np.median(splats.opacity))))
-    selected, tally = select(splats, settings)
-    assert sum(tally.dropped.values()) == 50 - len(selected) > 0
-    assert tally.dropped["zero_scale"] == 1
-    parts = [select(splats.take(slice(start, start + 20)), settings) for start in (0, 20, 40)]
-    assert parts[0][1].then(parts[1][1]).then(parts[2][1]) == tally
-    assert np.array_equal(np.concatenate([part.center for part, _ in parts]), selected.center)
-    with pytest.raises(InvalidSplatsError, match="no splats"):
-        settings.selection.check(select(random_splats(0), settings)[1])
-
-
 CODES = WriteOptions(rad=RadOptions(sh_codes=64), sog=SogOptions(64))
 OUTPUTS: dict[str, dict[str, Any]] = {
     "a.spz": {},
@@ -384,63 +355,3 @@ def test_progress_names_the_stages_in_the_order_of_their_shares(output: str, out
     )
     assert [stage for stage in stage_shares(how) if stage in stages] == list(stages)
     assert stages
-
-
-STREAMED = {
-    "spz": BakeSettings(),
-    "rad": BakeSettings(suffix=".rad"),
-    "rad-chunked": BakeSettings(suffix=".rad", options=WriteOptions(rad=RadOptions(chunked=True))),
-    "a palette": BakeSettings(suffix=".rad", options=WriteOptions(rad=RadOptions(sh_codes=50))),
-}
-
-
-@pytest.fixture(scope="module")
-def tree_scene() -> Scene:
-    splats = random_splats(2_000, sh_degree=1)
-    splats.rgb[7], splats.scale[3, 1] = 40, 1e-20
-    return Scene(*quick.build(splats, 1.5))
-
-
-def write_stream(target: Path, how: BakeSettings, scene: Scene, nodes: Scene | Reader, last: float) -> Baked:
-    """Write a tree window by window; reading windows after `last` fails."""
-
-    def encode(tree: BuiltTree, encoder: encoding.Encoder) -> encoding.Windows:
-        read = nodes.read if isinstance(nodes, Reader) else node_stream(nodes).read
-        windows = [encoder.encode(*read(part.start, part.stop), part.start) for part in windows_of(len(scene))]
-
-        def window(number: int, name: str) -> np.ndarray:
-            if number > last:
-                raise OSError("gone")
-            return windows[number][name]
-
-        return window
-
-    tree = output_of(target, how, overwrite=False)
-    needed = tree.form.codec().needed(tree.options)
-    leaf = scene.tree.is_leaf
-    parts = np.array_split(np.arange(len(scene)), 3)
-    tree.statistics = Statistics.merged([Statistics.of(scene.splats.take(at), leaf[at], needed) for at in parts])
-    tree.nodes, tree.baked.nodes, tree.baked.sh_degree = nodes, len(scene), 1
-    write_windows(tree, encode, 2, silent)
-    tree.baked.seconds.clear()
-    return tree.baked
-
-
-@pytest.mark.parametrize("name", STREAMED)
-def test_a_stream_of_nodes_is_written_as_their_scene(
-    name: str, tree_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sparklod_cli.codecs.encoder.CHUNK_NODES", 900)
-    how, results, files = STREAMED[name], [], []
-    stream = node_stream(tree_scene)
-    for nodes in (tree_scene, stream):
-        folder = tmp_path / type(nodes).__name__
-        folder.mkdir()
-        results.append(write_stream(folder / f"town{how.suffix}", how, tree_scene, nodes, math.inf))
-        files.append({each.name: each.read_bytes() for each in folder.iterdir()})
-    assert results[0] == results[1] and results[0].clamped
-    assert files[0] == files[1]
-    assert len(files[0]) == (1 if name != "rad-chunked" else 1 + -(-len(tree_scene) // 900))
-    with pytest.raises(OutputError, match="gone"):
-        write_stream(tmp_path / f"gone{how.suffix}", how, tree_scene, stream, 0)
-    assert len(list(tmp_path.iterdir())) == 2  # windows that cannot be read leave no output

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,21 +13,15 @@ import pytest
 from sparklod_cli.bake.flow import bake
 from sparklod_cli.bake.settings import Baked, BakeSettings, Resources
 from sparklod_cli.bake.skipping import SUFFIX, bake_unless_there
-from sparklod_cli.cameras.camera import Camera
-from sparklod_cli.cli import run
-from sparklod_cli.codecs import layouts
 from sparklod_cli.codecs.formats import WRITABLE, RadOptions, WriteOptions
 from sparklod_cli.codecs.spark_codings import SplatEncoding
 from sparklod_cli.fitting import fit, pictures
 from sparklod_cli.fitting.fit_settings import SHARES, FitSettings
-from sparklod_cli.io.reading import read_parts, read_scene
-from sparklod_cli.lod.tree_settings import DetailSettings
+from sparklod_cli.io.reading import read_scene
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.splats import same_rows
 from sparklod_cli.system.errors import CameraPathError, FormatError, InvalidSplatsError, OutOfMemoryError, OutputError
 from sparklod_cli.system.output import write_file
-from sparklod_cli.viewers.loaded_scene import Forest, TreeInstance
-from sparklod_cli.viewers.spark import SparkViewer
 from tests.conftest import FIXTURES
 from tests.fittings import StandIn
 from tests.fittings import stand_in as stand_in
@@ -279,37 +272,3 @@ def test_a_fitted_tree_has_the_same_leaves_and_mostly_new_merged_splats(
     assert 0 < report.kept <= 1
     bake(folder / "tree.rad", folder / "again.rad", FITTED, threads=2)
     assert (folder / "again.rad").read_bytes() == (folder / "fitted.rad").read_bytes()
-
-
-@pytest.mark.parametrize("name", ["fitted.spz", "fitted-2.spz", "plain.rad"])
-def test_every_format_holds_a_fitted_tree(folder: Path, fitted: Scene, name: str) -> None:
-    options = WriteOptions(spz_version=2) if "2" in name else WriteOptions()
-    write_file(folder / name, WRITABLE[Path(name).suffix].codec().encode(fitted, options), overwrite=False)
-    read = read_scene(folder / name)
-    assert fitted.tree is not None
-    assert read.tree is not None
-    assert np.array_equal(read.tree.child_count, fitted.tree.child_count)
-    low = math.exp(-10)  # of SPZ
-    small = (fitted.splats.scale > low).all(axis=1)
-    np.testing.assert_allclose(np.log(read.splats.scale[small]), np.log(fitted.splats.scale[small]), atol=0.1)
-    np.testing.assert_allclose(read.splats.center, fitted.splats.center, atol=2e-3)
-    assert run(["inspect", str(folder / name), "--check", "-q"]) == 0
-
-
-@pytest.mark.parametrize("share", SHARES)
-def test_cuts_of_a_fitted_tree_spend_their_budget(fitted: Scene, share: float) -> None:
-    assert fitted.tree is not None
-    packed = layouts.pack_nodes(fitted.splats, fitted.tree, threads=1)
-    viewer, budget = SparkViewer(Forest([layouts.unpack_nodes(packed)]), [TreeInstance()]), int(share * COUNT)
-    for eye in ((0.0, 0.0, -6.0), (3.0, -1.0, 2.0)):
-        cut = viewer.cut(Camera.look_at(eye, (0, 0, 0)), budget=budget)
-        drawn = sum(map(len, cut.indices()))
-        assert budget - int(fitted.tree.child_count.max()) < drawn <= budget
-
-
-def test_levels_can_be_cut_from_a_fitted_tree(folder: Path, baked: Baked) -> None:
-    settings = BakeSettings(method="quality", detail=DetailSettings(levels=(0.5, 0.2)), suffix=".json", converts=True)
-    bake(folder / "fitted.rad", folder / "web" / "lod-meta.json", settings)
-    levels = read_parts(folder / "web" / "lod-meta.json")
-    assert len(levels.counts[0]) == 3
-    assert levels.splats.opacity.max() <= 1

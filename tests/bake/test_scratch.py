@@ -26,10 +26,9 @@ from sparklod_cli.bake.planning import LOCK, MANIFEST, at_work
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.bake.store import Store
 from sparklod_cli.system.addresses import Address, Place
-from sparklod_cli.system.errors import FormatError, ScratchError, UnreadableError
+from sparklod_cli.system.errors import ScratchError, UnreadableError
 from sparklod_cli.system.stdio import DASH
 from tests.conftest import IS_ROOT, ROOT
-from tests.faults.test_faults import mounted
 
 DTYPES = st.sampled_from(["<f4", "<f8", "<i4", "<i8", "<u2", "<u8", "|u1", "|b1", "<f2"])
 SHAPES = arrays_of.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=6)
@@ -180,16 +179,6 @@ def test_a_truncated_file_is_no_result(store: Store, left: int) -> None:
         store.rows("x", "center", 0, 1)
 
 
-def test_a_full_disk_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
-    with mounted(tmp_path / "disk", "size=64k") as disk:
-        store = Store(disk / "scratch")
-        store.put("small", ARRAYS)
-        with pytest.raises(ScratchError, match=r"no room left in the scratch folder .*: no space left.*--resume"):
-            store.put("x", {"center": np.zeros(100_000)})
-        assert store.names() == ["small"]
-        assert store.is_sound("small")
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")
 def test_a_limit_of_file_size_is_an_error(store: Store) -> None:
     before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.getsignal(signal.SIGXFSZ)
@@ -282,24 +271,12 @@ def test_results_are_kept_after_an_interruption_and_used_by_resume(store: Store,
     assert not Path(str(store)).exists()
 
 
-def test_results_are_removed_after_an_error_that_would_come_again(store: Store) -> None:
-    assert Run(store).interrupted(FormatError("x")).said == []
-    assert not Path(str(store)).exists()
-
-
 def test_an_interruption_before_the_first_result_leaves_no_folder(store: Store) -> None:
     run = Run(store)
     with pytest.raises(KeyboardInterrupt), run.begun():
         raise KeyboardInterrupt
     assert not Path(str(store)).exists()
     assert run.said == []
-
-
-def test_overwrite_begins_anew(store: Store) -> None:
-    Run(store).interrupted()
-    with Run(store).begun(overwrite=True, block_splats=50) as block_splats:
-        assert block_splats == 50
-        assert store.names() == [MANIFEST]
 
 
 @pytest.mark.parametrize(

@@ -148,15 +148,6 @@ def test_a_truncated_or_missing_output_is_baked(scene: Path, target: Path) -> No
     assert bake_unless_there(scene, target, SETTINGS) is not None
 
 
-def test_a_missing_chunk_is_noticed(scene: Path, tmp_path: Path) -> None:
-    target = tmp_path / "a.rad"
-    bake_unless_there(scene, target, CHUNKED)
-    (chunk,) = tmp_path.glob("*.radc")
-    chunk.unlink()
-    assert bake_unless_there(scene, target, CHUNKED, overwrite=True) is not None
-    assert chunk.exists()
-
-
 @pytest.mark.parametrize("name", ["a.spz", "a.rad", "a-0.radc", "web/lod-meta.json", "web/0_0/sh0.webp"])
 def test_damage_in_any_file_is_found(scene: Path, tmp_path: Path, name: str) -> None:
     """By its date, or where that was set back, by `verify` alone."""
