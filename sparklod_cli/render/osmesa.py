@@ -31,53 +31,6 @@ Words = NDArray[np.uint32]
 Indices = NDArray[np.uint32]
 
 
-class Order:
-    """Order of the splats, from near to far, for a moving camera.
-
-    Args:
-        sorting: one of `render_settings.SORTINGS`.
-        throttle: splats are sorted again only when the cosine between the camera's direction at the last sort and its
-            current direction is at most 1 - throttle; antimatter15's viewer uses 0.01, an angle of 8.1 degrees. 0 sorts
-            for each camera. With `RasterSettings.sort` "radial", which depends on the camera's position, splats are
-            also sorted when it has moved so far that the splat of median distance appears rotated by that angle.
-    """
-
-    def __init__(self, sorting: str, throttle: float) -> None:
-        self.sorting, self.throttle = sorting, throttle
-        self._sorted: tuple[Camera, RasterSettings, float] | None = None
-
-    def forget(self) -> None:
-        self._sorted = None
-
-    def update(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> Indices | None:
-        """Sort the splats that may be visible; return their indices, or None while the last order is still valid."""
-        if self._sorted is not None and self._close(camera, raster, *self._sorted):
-            return None
-        with np.errstate(over="ignore", invalid="ignore"):  # splats that far away are not drawn
-            x, y, z = splats.center.T
-            # Right, down and forward, rounded as in the rasterizer's kernel.
-            u, v, depth = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in world_to_camera(camera))
-            key = np.sqrt(u * u + v * v + depth * depth) if raster.sort == "radial" else depth
-            if self.throttle:  # splats that are invisible now may be visible when this order is reused
-                seen = np.flatnonzero(np.isfinite(key)).astype(np.uint32)
-            else:
-                seen = _in_sight(splats, u, v, depth, camera, raster)
-        key = key[seen]
-        self._sorted = camera, raster, float(np.median(np.abs(key))) if len(key) else 0.0
-        return seen[SORT[self.sorting](key)]
-
-    def _close(
-        self, camera: Camera, raster: RasterSettings, old: Camera, old_raster: RasterSettings, middle: float
-    ) -> bool:
-        if not self.throttle or raster.sort != old_raster.sort:
-            return False
-        if 1 - float(camera.forward @ old.forward) >= self.throttle:
-            return False
-        if raster.sort != "radial":
-            return True  # moving the camera adds the same to all depths
-        return float(np.linalg.norm(camera.position - old.position)) < np.sqrt(2 * self.throttle) * middle
-
-
 def _in_sight(
     splats: ShadedSplats, u: FloatArray, v: FloatArray, depth: FloatArray, camera: Camera, raster: RasterSettings
 ) -> Indices:
@@ -132,16 +85,24 @@ def draw(splats: ShadedSplats, camera: Camera, raster: RasterSettings, **options
 
 
 class OpenGLRenderer:
-    """Draws a sequence of frames; compiles once, and uploads only what has changed.
+    """Draws a sequence of frames; compiles once, uploads what has changed, and sorts when the order has changed.
 
-    `precision` is one of `PRECISIONS`; `sorting` and `throttle` are those of `Order`.
+    Args:
+        precision: one of `PRECISIONS`.
+        sorting: one of `render_settings.SORTINGS`.
+        throttle: splats are sorted again only when the cosine between the camera's direction at the last sort and its
+            current direction is at most 1 - throttle; antimatter15's viewer uses 0.01, an angle of 8.1 degrees. 0 sorts
+            for each frame. With `RasterSettings.sort` "radial", which depends on the camera's position, splats are
+            also sorted when it has moved so far that the splat of median distance appears rotated by that angle.
     """
 
     def __init__(self, *, precision: str = "float", sorting: str = "exact", throttle: float = 0.0) -> None:
-        self._pack, self._order = PRECISIONS[precision], Order(sorting, throttle)
+        self._pack, self._sort, self._throttle = PRECISIONS[precision], SORT[sorting], throttle
         self.uploads = self.sorts = 0
         self._count, self._capacity, self._size = 0, 0, (0, 0)
         self._last: ShadedSplats | None = None
+        #: Camera and settings of the last sort, and the median of what splats were sorted by.
+        self._sorted: tuple[Camera, RasterSettings, float] | None = None
         self._texture: Any = None
         self._target: Any = None
         self._indices: Any = None
@@ -159,7 +120,8 @@ class OpenGLRenderer:
     def _draw(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> Image:
         self._context.gc()
         self._upload(splats)
-        self._sort(splats, camera, raster)
+        if not self._is_sorted(camera, raster):
+            self._write_order(splats, camera, raster)
         self._resize(camera.width, camera.height)
         self._target.use()
         self._target.clear()
@@ -178,7 +140,7 @@ class OpenGLRenderer:
         before, self._last = self._last, splats
         moved = before is None or not _is_same(before, splats, GEOMETRY)
         if moved:
-            self._order.forget()
+            self._sorted = None
         elif before is not None and self._texture is not None and _is_same(before, splats, ("rgb",)):
             return
         texture = self._pack(splats)
@@ -192,10 +154,31 @@ class OpenGLRenderer:
         self._texture.write(texture)
         self.uploads += 1
 
-    def _sort(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> None:
-        indices = self._order.update(splats, camera, raster)
-        if indices is None:
-            return
+    def _is_sorted(self, camera: Camera, raster: RasterSettings) -> bool:
+        """Return whether the order of the last sort is still valid."""
+        if self._sorted is None or not self._throttle:
+            return False
+        last, settings, middle = self._sorted
+        if raster.sort != settings.sort or 1 - float(camera.forward @ last.forward) >= self._throttle:
+            return False
+        if raster.sort != "radial":
+            return True  # moving the camera adds the same to all depths
+        return float(np.linalg.norm(camera.position - last.position)) < np.sqrt(2 * self._throttle) * middle
+
+    def _write_order(self, splats: ShadedSplats, camera: Camera, raster: RasterSettings) -> None:
+        """Sort the splats that may be visible from near to far, and upload their indices."""
+        with np.errstate(over="ignore", invalid="ignore"):  # splats that far away are not drawn
+            x, y, z = splats.center.T
+            # Right, down and forward, rounded as in the rasterizer's kernel.
+            u, v, depth = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in world_to_camera(camera))
+            key = np.sqrt(u * u + v * v + depth * depth) if raster.sort == "radial" else depth
+            if self._throttle:  # splats that are invisible now may be visible when this order is reused
+                seen = np.flatnonzero(np.isfinite(key)).astype(np.uint32)
+            else:
+                seen = _in_sight(splats, u, v, depth, camera, raster)
+        key = key[seen]
+        self._sorted = camera, raster, float(np.median(np.abs(key))) if len(key) else 0.0
+        indices = seen[self._sort(key)]
         self.sorts += 1
         self._count = len(indices)
         if self._array is None or self._capacity < len(splats):

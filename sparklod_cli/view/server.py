@@ -123,11 +123,9 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         if self._is_ours():
-            self._send_resource(body=True)
+            self._send_resource()
 
-    def do_HEAD(self) -> None:
-        if self._is_ours():
-            self._send_resource(body=False)
+    do_HEAD = do_GET
 
     def do_OPTIONS(self) -> None:
         """Send the methods and, with --cors, the headers that a page of another origin may use."""
@@ -183,17 +181,17 @@ class Handler(BaseHTTPRequestHandler):
         own = origin is None or origin.lower() == f"http://{self.headers.get('Host', '').lower()}"
         return own and site == "same-origin" and self.headers.get("Content-Type") == "application/json"
 
-    def _send_resource(self, *, body: bool) -> None:
+    def _send_resource(self) -> None:
         name = os.fsdecode(unquote_to_bytes(self.path.partition("?")[0].partition("#")[0])).removeprefix("/")
         content = self.server.site.resources.get(name or INDEX)
         if content is None:
             self._refuse(HTTPStatus.NOT_FOUND, "there is no such file")
         elif isinstance(content, Path):
-            self._send_file(content, media_type(name), body=body)
+            self._send_file(content, media_type(name))
         else:
-            self._answer(HTTPStatus.OK, {"Content-Type": media_type(name or INDEX)}, content, body=body)
+            self._answer(HTTPStatus.OK, {"Content-Type": media_type(name or INDEX)}, content)
 
-    def _send_file(self, path: Path, media: str, *, body: bool) -> None:
+    def _send_file(self, path: Path, media: str) -> None:
         try:
             file = open_plain(path)
         except OSError:
@@ -207,12 +205,10 @@ class Handler(BaseHTTPRequestHandler):
             if tag in (each.strip().removeprefix("W/") for each in self.headers.get("If-None-Match", "").split(",")):
                 self._answer(HTTPStatus.NOT_MODIFIED, headers)
                 return
-            wanted = self.headers.get("Range") if body else None  # a range has a meaning for GET only
-            if self.headers.get("If-Range", tag) not in (tag, modified):
-                wanted = None
-            span = span_of(wanted, found.st_size)
+            is_partial = self.command == "GET" and self.headers.get("If-Range", tag) in (tag, modified)
+            span = span_of(self.headers.get("Range") if is_partial else None, found.st_size)
             if span is None:
-                self._send_span(HTTPStatus.OK, headers, file if body else None, 0, found.st_size)
+                self._send_span(HTTPStatus.OK, headers, file, 0, found.st_size)
             elif not span:
                 self._refuse(
                     HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE,
@@ -224,10 +220,10 @@ class Handler(BaseHTTPRequestHandler):
                 self._send_span(HTTPStatus.PARTIAL_CONTENT, headers, file, span.start, len(span))
 
     def _send_span(
-        self, status: HTTPStatus, headers: Mapping[str, str], file: BinaryIO | None, first: int, count: int
+        self, status: HTTPStatus, headers: Mapping[str, str], file: BinaryIO, first: int, count: int
     ) -> None:
         self._begin(status, {**headers, "Content-Length": str(count)})
-        if file is None or not count:
+        if self.command == "HEAD" or not count:
             return
         self.wfile.flush()
         sent = 0
@@ -240,14 +236,12 @@ class Handler(BaseHTTPRequestHandler):
         """Send an error and end the connection, since the body of the request may be unread."""
         self.close_connection = True
         more = {"Content-Type": "text/plain; charset=utf-8", "Connection": "close", **(headers or {})}
-        self._answer(status, more, f"{text}\n".encode(), body=self.command != "HEAD")
+        self._answer(status, more, f"{text}\n".encode())
 
-    def _answer(
-        self, status: HTTPStatus, headers: Mapping[str, str], data: bytes | None = None, *, body: bool = True
-    ) -> None:
+    def _answer(self, status: HTTPStatus, headers: Mapping[str, str], data: bytes | None = None) -> None:
         length = {} if data is None else {"Content-Length": str(len(data))}
         self._begin(status, {**headers, **length})
-        if data is not None and body:
+        if data is not None and self.command != "HEAD":
             with contextlib.suppress(ConnectionError, TimeoutError):
                 self.wfile.write(data)
 

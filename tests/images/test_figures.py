@@ -438,7 +438,7 @@ def test_the_description_counts_what_is_drawn(scene: Scene) -> None:
     assert f"Depth 3 of {depth.max()}: {nodes} node" in picture.description
     assert (f"grey: {leaves} leaves" in picture.description) == (leaves > 0)
     assert "boxes: the 1 of 1 chunks of 65,536 nodes" in picture.description
-    assert "blue: on the walls, the grid of voxels of" in picture.description
+    assert "blue: on the walls, the grid of voxels of" in plot(scene).description
     assert "blue: the 1 voxel of" in plot(scene, depth=0).description
 
 
