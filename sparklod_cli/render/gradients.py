@@ -1,4 +1,4 @@
-"""Gradients of a picture: how a loss changes with each splat that the rasterizer draws."""
+"""Gradients: derivatives of a loss on a picture of the rasterizer by the properties of the splats."""
 
 from __future__ import annotations
 
@@ -20,31 +20,18 @@ from .render_settings import RasterSettings
 
 @dataclass(frozen=True)
 class SplatGradients:
-    """Derivatives of a loss by the properties of N splats, float32 views of one array; 0 for splats that are not drawn.
+    """Derivatives of a loss by properties of N splats, views of one float32 array; 0 for splats that are not drawn."""
 
-    Attributes:
-        center: (N, 3) per world unit.
-        log_scale: (N, 3) per unit of ln(scale).
-        turn: (N, 3) per radian of a rotation vector in the splat's own axes: q becomes q * exp(turn / 2).
-        lod_opacity: (N,) per unit of D; 0 above `ellipse.MAX_D`.
-        rgb: (N, 3) per unit of colour; where a colour is 0, of raising it.
-    """
-
-    center: FloatArray
-    log_scale: FloatArray
-    turn: FloatArray
-    lod_opacity: FloatArray
-    rgb: FloatArray
+    center: FloatArray  # (N, 3) per world unit
+    log_scale: FloatArray  # (N, 3) per unit of ln(scale)
+    turn: FloatArray  # (N, 3) per radian of a rotation vector in the splat's axes: q becomes q * exp(turn / 2)
+    lod_opacity: FloatArray  # (N,) per unit of D; 0 above `ellipse.MAX_D`
+    rgb: FloatArray  # (N, 3) per unit of colour; at 0, the derivative from above
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A picture with the data that `gradients` needs; made by `draw`.
-
-    Attributes:
-        image: (height, width, 4) float32, as `rasterizer.draw` returns it.
-        splats: their arrays must not have changed before `gradients`.
-    """
+    """A picture of `draw` with what its gradients need; the arrays of `splats` must not change before."""
 
     image: Image
     splats: ShadedSplats
@@ -53,12 +40,13 @@ class Drawing:
     drawn: backward.Drawn
 
     def gradients(self, by_image: Image) -> SplatGradients:
-        """Return derivatives of a loss by each splat, the same for any number of threads.
+        """Return derivatives of a loss by each splat, which do not depend on the number of threads.
 
-        Where a splat ends (at a number of standard deviations, at the least alpha, behind opaque ones) is held
-        constant, and so is the shape of a splat whose axes are shortened to the largest radius. `by_image` are the
-        (height, width, 4) float32 derivatives of the loss by the image's red, green and blue, which are multiplied by
-        alpha, and by alpha.
+        Held constant are the ends of a splat (at a number of standard deviations, at the least alpha, behind opaque
+        splats), and the shape of a splat whose axes are shortened to the largest radius.
+
+        Args:
+            by_image: (height, width, 4) float32 derivatives of the loss by premultiplied red, green, blue and by alpha.
         """
         drawn = self.drawn
         first = backward.first_rows(drawn.boxes)
@@ -78,7 +66,7 @@ class Drawing:
 
 
 def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Drawing:
-    """Draw the picture of `rasterizer.draw` for its gradients; `ValueError` for the profile `shifted`, without any."""
+    """Draw the picture of `rasterizer.draw` for its gradients; `ValueError` for the profile `shifted`."""
     if settings.profile == "shifted":
         raise ValueError("gradients of the profile shifted are not implemented; use the profile spark")
     screen, boxes, keys = rasterizer.project_splats(splats, camera, settings)
@@ -92,16 +80,16 @@ def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Draw
 def by_sh(
     center: FloatArray, eye: NDArray[np.float64], coefficients: int, rgb: FloatArray, by_rgb: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return derivatives by a splat's own colour and its SH, of those by the colour that a camera sees.
+    """Convert derivatives by the colours that a camera sees to derivatives by colours and SH coefficients.
 
     The direction from the camera to a splat is held constant.
 
     Args:
         center: (N, 3) float32 centres, in the space of the spherical harmonics.
-        eye: (3,) position of the camera, in that space.
-        coefficients: K, of degree 1 and above: 0, 3, 8 or 15.
-        rgb: (N, 3) colours that the camera sees, of `shade`.
-        by_rgb: (N, 3) float32 derivatives by these.
+        eye: (3,) position of the camera in that space.
+        coefficients: K, 0, 3, 8 or 15.
+        rgb: (N, 3) colours of `shade`.
+        by_rgb: (N, 3) float32 derivatives by `rgb`.
 
     Returns:
         (N, 3) by `Splats.rgb` and (N, K, 3) by `Splats.sh`, float32; 0 where the colour was clamped to 0.

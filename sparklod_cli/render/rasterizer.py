@@ -22,30 +22,22 @@ from .render_settings import BLUR, CLIP, RasterSettings
 
 @dataclass(frozen=True)
 class ShadedSplats:
-    """N splats in the world, in the colours that a camera sees.
+    """N splats in the world, in the colours that a camera sees, float32."""
 
-    Attributes:
-        center: (N, 3) float32 world units.
-        scale: (N, 3) float32 standard deviations, world units.
-        quat_xyzw: (N, 4) float32 unit quaternions, local to world.
-        lod_opacity: (N,) float32, Spark's D.
-        rgb: (N, 3) float32, display-referred, at least 0.
-    """
-
-    center: FloatArray
-    scale: FloatArray
-    quat_xyzw: FloatArray
-    lod_opacity: FloatArray
-    rgb: FloatArray
+    center: FloatArray  # (N, 3) world units
+    scale: FloatArray  # (N, 3) standard deviations, world units
+    quat_xyzw: FloatArray  # (N, 4) unit quaternions, local to world
+    lod_opacity: FloatArray  # (N,) Spark's D
+    rgb: FloatArray  # (N, 3) display-referred, at least 0
 
     def __len__(self) -> int:
         return len(self.center)
 
 
 def shade(parts: Sequence[tuple[Splats, Matrix]], camera: Camera) -> ShadedSplats:
-    """Shade splats with their places, (4, 4) object to world, as a camera sees them.
+    """Place splats by their (4, 4) matrices, object to world, and compute the colours that a camera sees.
 
-    Spherical harmonics are those of the direction from the camera to a splat's centre, in the space of its object.
+    Spherical harmonics are evaluated in the direction from the camera to a splat's centre, in the space of its object.
     """
     shaded = []
     for splats, matrix in parts:
@@ -64,25 +56,25 @@ Image = NDArray[np.float32]
 #: (N, 4) first and last tile across and down that each splat overlaps; empty for splats that are not drawn.
 Boxes = NDArray[np.int16]
 
-#: (M,) from near to far, see `kernels.project.project`.
+#: (M,) keys of `kernels.project.project`, from near to far.
 Keys = NDArray[np.uint64]
 
 _working_memory = threading.local()
 
-#: Bytes that processors fetch from memory at once.
+#: Bytes of a cache line.
 CACHE_LINE = 64
 
 #: Most pixels along a side of a picture: int16 holds the numbers of its tiles.
 MAX_SIDE = project.TILE * np.iinfo(np.int16).max
 
-#: Pieces a thread to sort splats into tiles in.
-CHUNKS = 2
+#: Blocks per thread in which splats are sorted into tiles.
+BLOCKS = 2
 
 
 def draw(splats: ShadedSplats, camera: Camera, settings: RasterSettings) -> Image:
-    """Draw what a camera sees: (height, width, 4) float32, red, green, blue, multiplied by alpha, and alpha; 0..1.
+    """Draw what a camera sees: (height, width, 4) float32 premultiplied red, green and blue, and alpha, 0..1.
 
-    The image is the same for any number of threads.
+    The image does not depend on the number of threads.
     """
     return draw_projected(*project_splats(splats, camera, settings), camera, settings)[0]
 
@@ -93,11 +85,11 @@ def draw_projected(
     """Draw splats of `project_splats`.
 
     Returns:
-        The picture; of each of T tiles (T + 1,) where in the list of splats it begins; (total,) this list, as
-        `sort_into_tiles` returns it; (T,) up to where in it each tile was drawn: it is opaque before the rest.
+        The picture; the starts of T tiles and the list of splats from `sort_into_tiles`; (T,) ends of the splats that
+        were drawn in each tile, which is opaque in front of the rest.
     """
     across, down = tiles_across(camera)
-    start, order = sort_into_tiles(boxes, keys, across, down, CHUNKS * threads_in_use())
+    start, order = sort_into_tiles(boxes, keys, across, down, BLOCKS * threads_in_use())
     stop, image = np.empty(across * down, np.int64), np.empty((camera.height, camera.width, 4), np.float32)
     is_design = settings.profile == "shifted"
     raster.draw_tiles(len(stop), screen, start, order, across, is_design, np.float32(MIN_ALPHA), image, stop)
@@ -107,12 +99,10 @@ def draw_projected(
 def sort_into_tiles(
     boxes: Boxes, keys: Keys, across: int, down: int, blocks: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-    """List the splats of each tile, from near to far.
-
-    Threads process `blocks` ranges of splats, on which the result does not depend.
+    """List the splats of each tile, from near to far; threads process `blocks` ranges of splats.
 
     Returns:
-        (tiles + 1,) where the splats of each tile begin; (total,) splats.
+        (tiles + 1,) positions in the list where tiles begin; (total,) the list of splats.
     """
     counts = np.zeros((blocks, across * down), np.int32)
     drawn = np.empty((len(keys), 4), np.int16)
@@ -126,7 +116,7 @@ def sort_into_tiles(
 
 
 def tiles_across(camera: Camera) -> tuple[int, int]:
-    """Return the numbers of tiles across and down a picture; raise `ValueError` above `MAX_SIDE` pixels."""
+    """Return the numbers of tiles across and down a picture; `ValueError` above `MAX_SIDE` pixels."""
     if max(camera.width, camera.height) > MAX_SIDE:
         raise ValueError(f"a picture of {camera.width} x {camera.height} pixels; at most {MAX_SIDE:,} along a side")
     return -(-camera.width // project.TILE), -(-camera.height // project.TILE)
@@ -138,15 +128,15 @@ def project_splats(
     """Project N splats onto the screen, of which M are drawn.
 
     Returns:
-        (N, `project.COLUMNS`) rows on the screen, filled for splats that are drawn; boxes; keys. Rows and boxes are
-        buffers, which the next call overwrites.
+        (N, `project.COLUMNS`) rows on the screen, filled for drawn splats; boxes; keys. The next call overwrites rows
+        and boxes.
     """
     tiles_across(camera)
     count = len(splats.center)
-    memory = _working_memory  # kept by each thread, as the first access to new memory is slow
+    memory = _working_memory  # reused by each thread, since the first access to new memory is slow
     if len(getattr(memory, "keys", ())) < count:
         floats = np.empty((count + 1) * project.COLUMNS, np.float32)
-        first = -floats.ctypes.data % CACHE_LINE // floats.itemsize  # each row is one line of the processor's cache
+        first = -floats.ctypes.data % CACHE_LINE // floats.itemsize  # each row fills one cache line
         memory.screen = floats[first : first + count * project.COLUMNS].reshape(count, project.COLUMNS)
         memory.boxes, memory.keys = np.empty((count, 4), np.int16), np.empty(count, np.uint64)
     screen, boxes, keys = memory.screen[:count], memory.boxes[:count], memory.keys[:count]
@@ -158,7 +148,7 @@ def project_splats(
 def arguments(
     splats: ShadedSplats, camera: Camera, settings: RasterSettings
 ) -> tuple[project.ShadedColumns, NDArray[np.float32], ellipse.Lens, ellipse.Limits]:
-    """Return the arguments of kernels: splats, world to camera, `Lens` and `Limits`."""
+    """Return splats, camera and settings as arguments of kernels."""
     columns = project.ShadedColumns(splats.center, splats.scale, splats.quat_xyzw, splats.lod_opacity, splats.rgb)
     lens = ellipse.Lens(*map(np.float32, (*camera.focal, *camera.principal, camera.width, camera.height)))
     near, far, radius = settings.near, settings.far, settings.max_radius
@@ -167,6 +157,6 @@ def arguments(
 
 
 def world_to_camera(camera: Camera) -> NDArray[np.float32]:
-    """Return the (3, 4) matrix into axes with y down, looking along z, clipped to the range of float32."""
+    """Return the (3, 4) matrix from the world into axes with y down and z forward, clipped to the range of float32."""
     turned = camera.camera_to_world @ FLIP
     return np.clip(np.linalg.inv(turned)[:3], -FARTHEST, FARTHEST).astype(np.float32)

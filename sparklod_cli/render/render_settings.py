@@ -1,4 +1,4 @@
-"""Settings of rasterization and rendering, defaults as in Spark 2; backends and devices. Imports nothing heavy."""
+"""Settings of rasterization and rendering, with Spark 2's defaults; backends and devices. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -15,17 +15,14 @@ from . import DEVICE_HELP, DEVICES
 #: Largest supersampling factor: samples per pixel along each axis.
 MAX_SUPERSAMPLE = 4
 
-#: Backends; numba is the default, and draws on the processor or on a card.
+#: Backends; numba draws on the processor or on a card.
 BACKENDS = ("numba", "osmesa", "open3d")
 
 
 def uses_card(device: str, say: Callable[[str], None] = lambda text: None) -> bool:
-    """Return True if a card is used for one of `DEVICES`; say so, or why not, in a line.
+    """Return whether one of `DEVICES` means a card here, and report the choice with `say`.
 
-    "auto" does without a word where the extra is not installed.
-
-    Raises:
-        BackendError: a card is requested, and none is usable.
+    `BackendError` for "cuda" without a usable card. "auto" without the extra reports nothing.
     """
     if device == "cpu" or (device == "auto" and importlib.util.find_spec("numba_cuda") is None):
         return False
@@ -43,29 +40,29 @@ def uses_card(device: str, say: Callable[[str], None] = lambda text: None) -> bo
     return True
 
 
-#: Pixels squared that are added to the covariance on the screen, for which opacity makes up: Spark's `blurAmount`.
+#: Pixels squared added to the covariance on the screen, compensated by opacity: Spark's `blurAmount`.
 BLUR = 0.3
 
-#: No splat is drawn farther from its centre, in pixels of the final picture: Spark's `maxPixelRadius`.
+#: Largest radius of a splat, in pixels of the final picture: Spark's `maxPixelRadius`.
 MAX_PIXEL_RADIUS = 512.0
 
-#: A splat is drawn only if its centre is within this multiple of the picture's half width and height: Spark's `clipXY`.
+#: Largest distance of a drawn centre from the middle, in halves of the picture's sides: Spark's `clipXY`.
 CLIP = 1.4
 
-#: How opacity falls off from the centre of a splat that is more than opaque.
+#: Falloffs of opacity from the centre of a merged splat.
 PROFILES = ("spark", "shifted")
 
-#: What is drawn: splats; opaque points of a pixel; discs of one opacity, in the order of the file or from far to near.
+#: Shapes of a splat: its Gaussian; an opaque pixel; a disc, in the order of the file or from far to near.
 STYLES = ("splats", "points", "billboards", "sorted-billboards")
 
-#: Quantities that can replace the colours of splats; those in `OF_PIXELS` are per pixel, the others per splat.
+#: Quantities that can replace the colours of splats, and those of them that are per pixel, not per splat.
 COLOR_BY = ("level", "lod-opacity", "size", "chunk", "overdraw", "depth")
 OF_PIXELS = ("overdraw", "depth")
 
-#: How the backend osmesa sorts splats: by their depths, or by 16 bits of them, as antimatter15's viewer does.
+#: Sortings of the backend osmesa: by depths, or by 16 bits of depths, as in antimatter15's viewer.
 SORTINGS = ("exact", "counting16")
 
-#: What splats are sorted by: the distance from the camera, or along its axis.
+#: Orders of splats: by distance from the camera, or along its axis.
 SORTS = ("radial", "z")
 
 #: Distances of the near and the far plane, world units.
@@ -77,10 +74,7 @@ class RasterSettings(CheckedSettings):
     """Settings of rasterization.
 
     Both profiles are exp(-z^2 / 2) up to D = 1. Above, Spark's is 1 - (1 - exp(-z^2 / 2)) ** exp((D^2 - 1) / e), and
-    that of its LoD design exp(-D / 2 * (z - (D - 1))^2).
-
-    Attributes:
-        max_radius: no splat is drawn farther from its centre, pixels.
+    that of its LoD design exp(-D / 2 * (z - (D - 1))^2). `max_radius` is the largest radius of a splat, pixels.
     """
 
     near: float = setting(
@@ -112,8 +106,7 @@ class RenderSettings(CheckedSettings):
     """Settings of rendering.
 
     Attributes:
-        raster: how splats become pixels.
-        max_sh: degrees of spherical harmonics above this are left out.
+        max_sh: highest degree of spherical harmonics that is drawn.
         options: of the backend.
     """
 

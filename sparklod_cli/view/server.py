@@ -125,7 +125,7 @@ class Handler(BaseHTTPRequestHandler):
         if self._is_ours():
             self._send_resource()
 
-    do_HEAD = do_GET
+    do_HEAD = do_GET  # noqa: N815
 
     def do_OPTIONS(self) -> None:
         """Send the methods and, with --cors, the headers that a page of another origin may use."""
