@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
-import json
 import runpy
 import shutil
 import sys
@@ -133,47 +131,6 @@ def camera(splats: sparklod.Splats) -> sparklod.Camera:
     """A camera that sees the splats from where the light comes."""
     middle = splats.center.mean(axis=0)
     return sparklod.Camera.look_at(middle + np.array([0.14, -0.24, -0.11]), middle, size=(96, 54))
-
-
-#: A program that is called as NanoGS is: it leaves the first rows of a PLY.
-FIRST_ROWS = """
-import argparse
-parser = argparse.ArgumentParser()
-for name in ("--ply", "-o", "-r"):
-    parser.add_argument(name)
-given = parser.parse_args()
-head, rows = open(given.ply, "rb").read().split(b"end_header\\n", 1)
-count = int(head.split(b"element vertex ")[1].split()[0])
-left = round(count * float(given.r))
-with open(given.o, "wb") as file:
-    file.write(head.replace(b"vertex %d" % count, b"vertex %d" % left) + b"end_header\\n")
-    file.write(rows[: left * (len(rows) // count)])
-"""
-
-
-def test_simplified_scenes_are_measured_as_whole_processes(
-    benchmark_module: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench = benchmark_module("bench_simplify")
-    (tmp_path / "simplification.py").write_text(FIRST_ROWS)
-    monkeypatch.setenv("NANOGS_DIR", str(tmp_path))
-    splats = benchmark_module("fine_structure").fine_structure().with_max_sh(0).take(slice(0, 50_000, 20))
-    comparison = bench.Comparison(sparklod.Scene(splats), (64, 36), 6, tmp_path)
-    found = {method: comparison.simplified(method).as_dict() for method in ("quick", "simplify", "nanogs")}
-    assert [len(each["seconds"]) for each in found.values()] == [1, 5, 5]
-    counts = {"50%": 1250, "25%": 625, "10%": 250, "5%": 125, "1%": 25}
-    assert found["nanogs"]["splats"] == found["quick"]["splats"] == counts
-    psnr = {method: each["views"]["around"]["10%"]["psnr"] for method, each in found.items()}
-    assert psnr["simplify"] > psnr["nanogs"], "merged splats are closer than the first ones"
-    assert all(peak > 1e7 for each in found.values() for peak in each["peak_bytes"])
-
-    tables = bench.tables({"a.ply": json.loads(json.dumps(found))})
-    assert tables["simplify"].count("\n") == 4
-    assert f"| a.ply | our quick | each | {psnr['quick']:.2f} |" in tables["simplify"]
-    assert f"| a.ply | NanoGS | all | {psnr['nanogs']:.2f} |" in tables["simplify"]
-    assert tables["sets"].count("\n") == 3, "no cuts"
-    assert "| photo-cloud.ply" not in bench.tables({"photo-cloud.ply": found})["simplify"], "a made scene"
-    benchmark_module("fidelity_report").put_into(_copied(tmp_path), tables)
 
 
 def _copied(folder: Path) -> Path:

@@ -118,34 +118,3 @@ def test_a_process_is_measured_from_outside(modules: Any, tmp_path: Path) -> Non
     with pytest.raises(process.CommandError, match="ValueError: no"):
         process.run([sys.executable, "-c", "raise ValueError('no')"])
     assert process.run([sys.executable, "-c", "raise SystemExit(3)"], codes=(0, 3)).output == ""
-
-
-def test_a_section_that_fails_is_told_and_the_others_go_on(
-    modules: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    run_all = importlib.import_module("run_all")
-    row = modules("rows").Row({"splats": 20_000}, {"picture_cpu_s": [0.1], "gradients_cpu_s": [0.2]})
-
-    def made_up(name: str, context: Any) -> Any:
-        if name == "sizes":
-            raise FileNotFoundError("there is no scene")
-        return measured(modules, [row] if name == "gradients" else [])
-
-    figures, page = tmp_path / "figures.json", tmp_path / "performance-viewing.md"
-    modules("figures").write(figures, {"sizes": measured(modules, [], notes=["of before"])})
-    places = ["--figures", str(figures), "--docs", str(tmp_path)]
-    line = ["run_all.py", "--sections", "short", "sizes", "gradients", *places]
-    monkeypatch.setattr(run_all, "measured", made_up)
-    monkeypatch.setattr(sys, "argv", line)
-    assert run_all.main() == 1
-    told = capsys.readouterr().out
-    assert "sizes failed: there is no scene" in told
-    assert "gradients of 20,000 splats within 25 ms: **missed** by 700 %" in told
-    assert list(modules("figures").read(figures)) == ["sizes", "short", "gradients"]
-    assert modules("figures").read(figures)["sizes"].notes == ["of before"]
-    assert "| 20,000 | 100.0 | 200.0 (200.0 to 200.0) | 2.0 |" in page.read_text()
-    monkeypatch.setattr(sys, "argv", ["run_all.py", "--write-page", *places])
-    page.write_text("old")
-    assert run_all.main() == 0
-    assert "| 20,000 | 100.0 |" in page.read_text()
