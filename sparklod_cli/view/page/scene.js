@@ -1,5 +1,6 @@
 // The files as Spark's meshes: RAD trees paged, chunk by chunk, everything else whole.
 import { SplatMesh } from '@sparkjsdev/spark';
+import { FileState } from './file_state.js';
 import { size, whole } from './text.js';
 
 /** Whether the host of a file sends ranges of it; without them, Spark would fetch the whole file for each chunk. */
@@ -11,18 +12,11 @@ async function hasRanges(url) {
   return partial;
 }
 
-export class ShownFile {
-  /**
-   * @param file as view.json has it.
-   * @param modifier of Spark, for its splats.
-   * @param group that it is loaded into.
-   * @param changed is called when its state changes.
-   * @param failed is called with what went wrong.
-   */
+export class ShownFile extends FileState {
+  /** A file whose splats Spark changes by a modifier and adds to a group. */
   constructor(file, modifier, group, changed, failed) {
-    Object.assign(this, { file, modifier, group, changed, failed, visible: true, builds: false, mesh: null });
-    Object.assign(this, { state: '', loading: false, bad: false });
-    this.isTree = file.leaves !== null;
+    super(file, changed, failed);
+    Object.assign(this, { modifier, group, mesh: null, loading: false, isTree: file.leaves !== null });
   }
 
   get paged() {
@@ -34,7 +28,7 @@ export class ShownFile {
     this.unload();
     const { file } = this;
     const url = new URL(file.url, document.baseURI).href;
-    this.loading = true;
+    Object.assign(this, { loading: true, bad: false });
     this.say(`loading ${size(0)} of ${size(file.bytes)}`);
     const pages = file.paged && (file.chunked || (await hasRanges(url)));
     const progress = (event) => this.loading && this.say(`loading ${size(event.loaded)} of ${size(file.bytes)}`);
@@ -47,7 +41,7 @@ export class ShownFile {
     try {
       await (pages ? this.firstChunk(mesh.paged) : mesh.initialized);
       if (this.mesh !== mesh) return;
-      this.loading = false;
+      Object.assign(this, { loading: false, bad: false });
       this.say(this.described(pages));
     } catch (error) {
       if (this.mesh === mesh) this.fail(error);
@@ -80,9 +74,8 @@ export class ShownFile {
   }
 
   show(visible) {
-    this.visible = visible;
     if (this.mesh) this.mesh.visible = visible;
-    this.changed(this);
+    super.show(visible);
   }
 
   unload() {
@@ -90,18 +83,5 @@ export class ShownFile {
     this.group.remove(this.mesh);
     this.mesh.dispose();
     this.mesh = null;
-  }
-
-  say(state, bad = false) {
-    this.state = state;
-    this.bad = bad;
-    this.changed(this);
-  }
-
-  fail(error) {
-    const text = String(error?.message ?? error);
-    this.loading = false;
-    this.say(`cannot be shown: ${text}`, true);
-    this.failed(`${this.file.name} cannot be shown: ${text}`);
   }
 }
