@@ -25,7 +25,7 @@ from sparklod_cli.system.threads import on_threads
 from sparklod_cli.viewers.loaded_scene import Forest, TreeCut, TreeInstance
 from sparklod_cli.viewers.spark import SparkViewer
 from sparklod_cli.viewers.viewer_settings import LodSettings
-from tests.lod.trees import CutView, check_threads, check_tree, children, links, parents, same, sorted_rows
+from tests.lod.trees import CutView, check_threads, check_tree, children, links, parents, sorted_rows
 from tests.references import chunk_orders
 from tests.references.chunk_orders import reordered, spark_order
 from tests.scenes import random_splats
@@ -235,12 +235,6 @@ def test_progress_ends_at_the_number_of_nodes(built: tuple[Splats, LodTree]) -> 
     arrange(*built, progress=lambda *event: seen.append(event))
     done = [at for _, at, _, _ in seen]
     assert done == sorted(done) and seen[-1] == ("arranging", len(built[1]), len(built[1]), "node")
-
-
-def test_arranging_twice_is_arranging_once(built: tuple[Splats, LodTree]) -> None:
-    """But for ties, of which this tree has none."""
-    once = arrange(*built)
-    assert same(arrange(*once), once)
 
 
 # Families

@@ -80,15 +80,6 @@ def test_weights_are_shares_that_sum_to_one_on_every_way_to_a_leaf_and_keep_the_
     np.testing.assert_allclose(list(sums_to_leaves(case, weights_of(case, cut))), 1)
 
 
-@pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("share", [0.01, 0.1, 0.5, 0.9])
-def test_weights_sum_to_the_budget_where_that_is_what_ends_the_cut(width: float, share: float) -> None:
-    case = some_case(1)
-    leaves = len(case.instances) * int(case.trees[0].tree.is_leaf.sum())
-    case = dataclasses.replace(case, budget=max(2, int(share * leaves)))
-    assert blended(case, width).weight.sum() == pytest.approx(case.budget, rel=1e-6)
-
-
 @given(cases(), st.sampled_from(WIDTHS))
 def test_with_a_large_budget_all_leaves_have_weight_one(case: Case, width: float) -> None:
     case = dataclasses.replace(case, budget=case.most, smallest=0.0)
@@ -146,14 +137,6 @@ def log_scales(case: Case, view: CutView) -> np.ndarray:
     return np.log(np.concatenate(scales).astype(np.float64))
 
 
-def test_shares_rise_from_nothing_at_the_threshold_to_all_at_its_multiple() -> None:
-    limit = np.array([0, 0.5, 1, math.sqrt(1.5), 1.5, 3, np.inf], np.float32)
-    np.testing.assert_allclose(shares(limit, 1.0, 1.5), [0, 0, 0, 0.5, 1, 1, 1], atol=1e-6)
-    np.testing.assert_array_equal(shares(limit, 0.0, 1.5), [0, 1, 1, 1, 1, 1, 1])
-    fine = shares(np.geomspace(0.9, 1.7, 1000, dtype=np.float32), 1.0, 1.5)
-    assert (np.diff(fine) >= 0).all()
-
-
 @given(
     st.lists(st.tuples(st.sampled_from([0.0, 0.5, 1.0, 1.01, 1.5, 2.0, 7.0, 1e30]), st.integers(0, 5)), max_size=30),
     st.integers(0, 60),
@@ -182,26 +165,6 @@ def test_at_a_threshold_the_cut_is_that_of_all_larger_nodes(case: Case) -> None:
     case = dataclasses.replace(case, budget=case.most, smallest=0.5)
     fine, coarse = (set(drawn(dataclasses.replace(case, smallest=limit).find())) for limit in (0.5, 0.5 * 1.25))
     assert fine & coarse <= set(drawn(blended(case, 1.25)))
-
-
-def test_a_tiny_step_across_a_threshold_changes_next_to_nothing() -> None:
-    case = some_case(3, foveation=Cones())
-    cuts = ContinuousCuts(case.viewer())
-    far, near = 6.0, 3.0
-
-    def nodes_from(z: float) -> set[tuple[int, int]]:
-        return set(drawn(dataclasses.replace(case, view=view_from(0.3, -0.2, z)).find()))
-
-    first = nodes_from(far)
-    assert nodes_from(near) != first
-    for _ in range(40):  # to where the ordinary cut changes
-        middle = (far + near) / 2
-        far, near = (middle, near) if nodes_from(middle) == first else (far, middle)
-    a, b = (
-        np.concatenate(weights_of(case, cuts.cut(view_from(0.3, -0.2, z), budget=case.budget, width=1.25)))
-        for z in (far, near)
-    )
-    assert np.abs(a - b).max() < 1e-4
 
 
 @given(cases())

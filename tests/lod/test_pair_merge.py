@@ -263,12 +263,6 @@ def test_the_error_of_a_picture_is_an_integral(seed: int) -> None:
     assert picture_error(a, b, merged) == pytest.approx(total / (2 * math.pi), rel=1e-4)
 
 
-def test_a_merged_node_that_looks_as_its_two_is_without_error() -> None:
-    a, nothing = twin.random_rows(2, seed=5)
-    nothing[DENSITY] = 0
-    assert picture_error(a, nothing, a) == pytest.approx(0, abs=1e-5)
-
-
 def united(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     merged = np.zeros_like(a)
     pair_merge.merge_pair(a, b, overlaps(a, b), merged)

@@ -253,19 +253,6 @@ def test_no_more_are_kept_than_asked_for_and_their_parents_are_nearest_of_them(b
     assert np.array_equal(binary.saved[inner - binary.leaves] + 1, children[inner])
 
 
-def test_the_most_useful_nodes_are_kept() -> None:
-    """Of two inner nodes under a root, equal but for their errors, the one with less of it."""
-    children = np.array([[0, 1], [2, 3], [4, 5]], np.uint32)
-    for worse in (0, 1):
-        log_size = np.array([1, 1, 1, 1, 2, 2, 8], np.float32)
-        lost = np.array([0.1, 0.1, 1], np.float32)
-        lost[worse] = 0.4
-        weight, saved = np.empty(3, np.float32), np.ones(3, np.int32)
-        parent = quality.fill_usefulness_terms(children, 4, 4, 6, log_size, lost, weight, 2)
-        quality.drop_nodes(4, 2, parent, log_size, lost, weight, saved, 2)
-        assert saved.tolist() == ([-1, 1, 2] if worse == 0 else [1, -1, 2])
-
-
 @given(st.integers(2, 150), st.integers(0, 2**32 - 1), st.booleans(), st.integers(2, 9), st.floats(0, 1))
 def test_the_number_of_blocks_changes_nothing(leaves: int, seed: int, equal: bool, blocks: int, share: float) -> None:
     one, many = (Binary(leaves, seed, equal, count) for count in (1, blocks))
