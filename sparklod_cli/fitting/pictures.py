@@ -1,4 +1,4 @@
-"""Nodes under change, cameras, pictures of full detail, laws of fitted nodes, and steps of the optimiser."""
+"""Fitted nodes, cameras, pictures of full detail, laws of fitted nodes, and steps of the optimiser."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Index = NDArray[np.int64]
 
 
 class FittedNodes:
-    """The nodes of a tree under change.
+    """The nodes of a tree while its merged splats are fitted.
 
     Attributes:
         columns: current columns of the nodes, changed in place.
@@ -360,7 +360,7 @@ def gain(before: Scores, after: Scores) -> float:
 
 
 def keep_sizes(nodes: FittedNodes) -> bool:
-    """Restore nodes that became too small for their children, and were not so originally; return True if there are any.
+    """Restore nodes that became too small for their children, unless they were so originally; return True if any.
 
     A parent is refined before its children if it is larger; a small parent is drawn in their place for too long
     (docs/decisions/11-quality-builder.md).

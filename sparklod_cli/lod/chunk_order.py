@@ -153,6 +153,7 @@ def _families(
     order: NDArray[np.uint32],
     threads: int,
 ) -> Families:
+    """Return a part's families, given in any order, in the order `order`: by descending size, with their demand."""
     above, center = parent[order], center[order]
     parent = np.where(above < 0, np.int32(-1), _places(order)[above])
     records = np.zeros(len(order), NODE)

@@ -50,7 +50,7 @@ def joined(parts: Sequence[Pending]) -> Pending:
 
 @dataclass(frozen=True, eq=False)
 class StageFamilies:
-    """The F nodes that a stage gave children to, and these C children.
+    """Families that a stage made: F parents, and their C children in all.
 
     The final order is: the root, then the children of all nodes of all stages, by batch and then by key. A node comes
     before its children.

@@ -127,6 +127,7 @@ class Selection:
             raise InvalidSplatsError(f"no splat is left of {tally.count:,} ({describe(tally.dropped)})")
 
     def _inside(self, center: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return a (N,) mask of the centres inside the box and the ball."""
         inside = np.ones(len(center), np.bool_)
         if self.min_box is not None:
             inside &= (center >= np.asarray(self.min_box, np.float32)).all(axis=1)
