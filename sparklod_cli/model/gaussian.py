@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from .splats import FloatArray, Splats
 
-#: Least and largest linear opacity A of a merged splat; 1000 is D = 4.45 of the 5 that Spark's encodings hold. Builders
-#: clamp at the least; the largest D that they give a splat, `profile.MAX_D`, keeps them well below the other.
+#: Least and largest linear opacity A of a merged splat; 1000 is D = 4.45, where Spark's encodings hold up to 5.
+#: Builders clamp to the least; their largest D, `lod.kernels.geometry.MAX_D`, is well below the other.
 MIN_OPACITY, MAX_OPACITY = 1e-6, 1e3
 
 #: Range of a quaternion's length in which float32 holds the squares of its components: 1e-30 to 1e30.
@@ -52,7 +52,7 @@ def linear_opacity_above_1(lod_opacity: Any, one: Any, e: Any) -> Any:
 
 
 def normalized_quat(quat: FloatArray) -> FloatArray:
-    """Return unit quaternions from (N, 4) of any length; one of length 0 or that is not finite becomes NaN."""
+    """Normalize (N, 4) quaternions of any length; those of length 0, or not finite, become NaN."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         length = np.sqrt(np.einsum("ij,ij->i", quat, quat))
         extreme = np.flatnonzero(~((length > MIN_LENGTH) & (length < MAX_LENGTH)))
@@ -69,7 +69,7 @@ def normalized_quat(quat: FloatArray) -> FloatArray:
 def covariance(scale: FloatArray, quat_xyzw: FloatArray) -> NDArray[np.float64]:
     """Return (N, 6) covariances R diag(scale ** 2) R^T, xx xy xz yy yz zz, of (N, 3) scales and (N, 4) quaternions.
 
-    In float64, because elements of a thin splat's covariance are small differences of large numbers.
+    In float64, as the elements for a thin splat are small differences of large numbers.
     """
     axes = rotation_matrices(quat_xyzw)
     axes *= scale.T
@@ -145,7 +145,7 @@ def size_factor(lod_opacity: FloatArray, out: FloatArray | None = None) -> Float
     return factor
 
 
-@np.errstate(over="ignore", invalid="ignore")  # reports ask for that of scales that are not finite, too
+@np.errstate(over="ignore", invalid="ignore")  # reports need it for scales that are not finite, too
 def spark_size(splats: Splats) -> FloatArray:
     """Return (N,) feature size, 2 * mean(scale) * (1 + 0.7 * max(0, D - 1)): what Spark 2.2.0 writes into its nodes.
 

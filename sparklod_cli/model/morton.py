@@ -1,4 +1,4 @@
-"""The Morton curve: an order of points in which neighbours in space are mostly near each other."""
+"""The Morton curve: an order of points that keeps most neighbours in space together."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .splats import FloatArray
 #: Bits of a coordinate along each axis of the bounding box: three of them fill a word of 64 bits.
 BITS = 21
 
-#: Steps that spread the bits of a word, until two zeros separate any two of them: shift, and mask of the result.
+#: Steps that insert two zeros between the bits of a word: shift, and mask of the result.
 _SPREADING = (
     (32, 0x001F00000000FFFF),
     (16, 0x001F0000FF0000FF),
@@ -37,9 +37,9 @@ def order(center: FloatArray) -> NDArray[np.intp]:
 
 
 def order_of_cells(cells: NDArray[np.unsignedinteger[Any]]) -> NDArray[np.intp]:
-    """Return the order of points by (N, 3) numbers of their cells along each axis, below 2 ** BITS.
+    """Return the order of points along the Morton curve, by (N, 3) numbers of their cells, below 2 ** BITS.
 
-    The curve takes the bits of z, y and x in turns, z first. Points of one cell keep their order.
+    Codes interleave the bits of z, y and x, z first. Points of one cell keep their order.
     """
     codes = np.zeros(len(cells), np.uint64)
     for axis in range(3):

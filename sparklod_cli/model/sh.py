@@ -27,15 +27,15 @@ COEFFICIENTS = (0, 3, 8, 15, 24)
 
 
 def width_of(sh_degree: int) -> int:
-    """Return how many numbers a splat has: 14 of centre, scale, rotation, opacity and colour, and its SH."""
+    """Return the number of floats of a splat: 14 of centre, scale, rotation, opacity and colour, and its SH."""
     return 14 + 3 * COEFFICIENTS[sh_degree]
 
 
 def degree_of(coefficients: int) -> int:
-    """Return the degree with this many coefficients per channel above the constant term.
+    """Return the degree of a number of coefficients per channel above the constant term.
 
     Raises:
-        FormatError: no degree has this many.
+        FormatError: no degree has this number of coefficients.
     """
     try:
         return COEFFICIENTS.index(coefficients)
@@ -45,5 +45,5 @@ def degree_of(coefficients: int) -> int:
 
 
 def notes_on_degree(degree: int) -> tuple[str, ...]:
-    """Return a reader's notes on a file of this degree: one if coefficients above MAX_SH_DEGREE are dropped."""
+    """Return the notes on a file of an SH degree: one if coefficients above MAX_SH_DEGREE are dropped."""
     return (f"SH degree {degree} is cut to {MAX_SH_DEGREE}",) if degree > MAX_SH_DEGREE else ()

@@ -24,14 +24,14 @@ SECOND = 6
 #: Range of D in trees.
 LEAST_D, MOST_D = f32(0.004), f32(5)
 
-#: Least and largest scale, over that of the old splat; farthest centre, in its largest scales.
+#: Largest factor of a scale, either way, and largest move of a centre, in the largest scale of the original splat.
 MOST_CHANGE = f32(2)
 FARTHEST = f32(2)
 
 #: Colours stay in this range.
 LEAST_COLOR, MOST_COLOR = f32(-2), f32(4)
 
-#: A splat whose axis is shorter than this share of its mean scale moves along it as if it were that long.
+#: Least length of an axis, as a share of the mean scale, for steps along the axis.
 THIN = f32(0.1)
 
 TINY = f32(1e-30)
@@ -214,10 +214,10 @@ def step_of(i, nodes, old, index, slots, gradients, rates, moments, bounds):
 
 @kernel(i8, out(Columns), Columns, i8[:], i4[:], Gradients, Rates, Moments, FitBounds, ranges=True)
 def step(start, stop, nodes, old, index, slots, gradients, rates, moments, bounds):
-    """Move the merged splats that were drawn against their gradients.
+    """Move the drawn merged splats against their gradients.
 
     Args:
-        old: columns as they were at first, from which scale and centre do not go too far.
+        old: original columns, near which scales and centres stay.
         index: (M,) node of each drawn splat.
         slots: (N,) row of each node in `moments`; -1 for leaves.
     """

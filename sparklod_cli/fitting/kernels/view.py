@@ -11,7 +11,7 @@ f32 = np.float32
 
 ZERO, ONE = f32(0), f32(1)
 
-#: Steps of the values of pictures of full detail, which are held in 16 bits.
+#: Unit of the values of pictures of full detail, in 16 bits.
 LEVEL = f32(1 / 65535)
 
 
@@ -45,7 +45,7 @@ def clipped(value):
 
 @kernel(inline=True)
 def differences(image, full, y, x, c):
-    """Return the differences of a colour on black and on white."""
+    """Return the differences of a colour from full detail, on black and on white."""
     a, b = image[y, x, c], LEVEL * f32(full[y, x, c])
     behind, full_behind = ONE - image[y, x, 3], ONE - LEVEL * f32(full[y, x, 3])
     return clipped(a) - clipped(b), clipped(a + behind) - clipped(b + full_behind)

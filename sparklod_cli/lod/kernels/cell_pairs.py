@@ -1,12 +1,12 @@
-"""Merges the nodes of each cell of the quick builder's grid: the cheapest pairs of neighbours, round by round.
+"""Merging of the nodes of each cell of the quick builder's grid: the cheapest pairs of neighbours, round by round.
 
-A cell's nodes lie along a curve. In each round, every node looks for its cheapest partner among the next few on either
-side, in its own cell only, and pairs that chose each other become one node that covers the union of both. The nodes
-merged into one during all rounds of a level become a family. As nothing outside a cell matters, a tree can be built in
-parts.
+A cell's nodes lie along a curve. In each round, every node finds its cheapest partner among the next few nodes on
+either side, in its own cell only, and pairs that chose each other become one node that covers the union of both. The
+nodes merged into one during all rounds of a level become a family. As nothing outside a cell matters, a tree can be
+built in parts.
 
-Node rows are those of `pair_merge.py`. The cells of a span of nodes are worked on together, in columns, so that LLVM
-vectorizes over nodes; results do not depend on how cells are put together.
+Node rows are those of `pair_merge.py`. The cells of a span of nodes are processed together, in columns, so that LLVM
+vectorizes over nodes; results do not depend on the spans.
 """
 
 from __future__ import annotations
@@ -25,34 +25,33 @@ f32 = np.float32
 #: Nodes of a span: its columns, 32 KB, stay near the processor. Results do not depend on it.
 SPAN = 512
 
-#: Room between columns: with a power of two from one to the next, all of them would share a few lines of the cache.
+#: Padding of columns: with a power of two as their length, they would share a few lines of the cache.
 PADDING = 16
 
 #: Rounds of merging at a level, and the largest distance of a partner on the curve. Measured, as the next three
 #: (benchmarks/notes/quick-builder.md): fewer rounds give more nodes, a larger window takes longer.
 ROUNDS, WINDOW = 6, 3
 
-#: A family has at least this many children, or waits for the next level, where it may get more.
+#: Least number of children of a family; smaller families wait for the next level, where they may grow.
 LEAST_CHILDREN = 5
 
-#: A family does not wait if its variance is at most this share of the largest of the level. This bounds how often
-#: nodes merge in vain.
+#: Share of the largest variance of a level up to which small families do not wait, to limit merges in vain.
 PATIENCE = f32(0.15)
 
 #: The largest finite float32: cost of any pair in a cell without a limit, so that no cost keeps a tree from ending.
 LARGEST_COST = np.finfo(np.float32).max
 
-#: Two nodes do not overlap from this exponent on: e^-30 is 1e-13, and coverage is a float32. Chosen.
+#: Exponent from which on two nodes do not overlap: e^-30 is 1e-13, and coverage is a float32. Chosen.
 MAX_EXPONENT = f32(30)
 
-#: Bound of an offset over the length of both nodes' spread, where they do not overlap any more, and of a density, far
-#: above that of any profile, so that products stay within float32. Chosen.
+#: Bounds, so that products stay within float32: of an offset in units of both nodes' spread, far beyond any overlap,
+#: and of a density, far above that of any profile. Chosen.
 FARTHEST, DENSEST = f32(1e4), f32(1e4)
 
 #: Least trace of a covariance here, units squared. Chosen.
 LEAST_TRACE = f32(1e-30)
 
-#: Pairs that are united side by side. Results do not depend on it.
+#: Number of pairs united side by side. Results do not depend on it.
 GROUP = 64
 
 #: The area of an ellipsoid over the root of the sum of its covariance's principal minors, if that is a sphere.
@@ -63,7 +62,7 @@ LOG2_E = f32(math.log2(math.e))
 
 @kernel(inline_late=True)
 def on_plane(axx, ayy, axy, bxx, byy, bxy, x, y, density_a, density_b):
-    """Return coverage on a plane / (2 pi) of two Gaussians' overlap, and of both; heights are `density_a` and `_b`."""
+    """Return the coverage / (2 pi) of the overlap of two Gaussians on a plane, and of both; densities are heights."""
     area_a = math.sqrt(max(axx * ayy - axy * axy, f32(0)))
     area_b = math.sqrt(max(bxx * byy - bxy * bxy, f32(0)))
     xx, yy, xy = axx + bxx, ayy + byy, axy + bxy
@@ -76,15 +75,15 @@ def on_plane(axx, ayy, axy, bxx, byy, bxy, x, y, density_a, density_b):
 
 @kernel()
 def unite(a, b):
-    """Replace nodes by the unions of each with another one.
+    """Replace each node of `a` by its union with the node of `b`.
 
-    The overlap of two nodes covers a share h of what both cover, at most 0.5, which is measured on the planes of the
-    three axes. It is in the middle, and about half as wide as the two: its moments are those of the union less. The
-    remaining covariance, ((1 - h / 2) (u P + v Q) + u v d d^T) / (1 - h), is always positive semidefinite; u and v are
-    the nodes' shares of the coverage, P and Q their covariances, d is the offset from one to the other. `a` and `b` are
-    (WIDTH * GROUP,) columns of node rows, one after the other.
+    The overlap of two nodes is a share h of their coverage, at most 0.5, measured on the planes of the three axes. It
+    is in the middle, and about half as wide as the two nodes; its moments are subtracted. The remaining covariance,
+    ((1 - h / 2) (u P + v Q) + u v d d^T) / (1 - h), is always positive semidefinite; u and v are the nodes' shares of
+    the coverage, P and Q their covariances, d is the offset between them. `a` and `b` are (WIDTH * GROUP,) columns of
+    node rows, one after the other.
     """
-    # The stride and the number of nodes are constants, so that LLVM vectorizes without a doubt about what overlaps.
+    # The stride and the number of nodes are constants, so that LLVM knows that no arrays overlap, and vectorizes.
     for i in range(GROUP):
         px, py, pz = a[i], a[GROUP + i], a[2 * GROUP + i]
         pxx, pyy, pzz = a[3 * GROUP + i], a[4 * GROUP + i], a[5 * GROUP + i]
@@ -138,7 +137,7 @@ def unite(a, b):
 
 @kernel()
 def finish_row(lanes, i, row):
-    """Fill the node row of node i, with the density of its coverage over the area of its ellipsoid."""
+    """Fill the node row of node i, with its exact density: coverage over the area of its ellipsoid."""
     for column in range(WIDTH):
         row[column] = lanes[column, i]
     large, middle, small = semi_axes(
@@ -154,12 +153,11 @@ def finish_row(lanes, i, row):
 
 @kernel()
 def find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at):
-    """Fill `best` and `at`: cost and place in the cell, or -1, of each node's cheapest partner in a span.
+    """Fill the cost, `best`, and the place in the cell, `at` (or -1), of each node's cheapest partner in a span.
 
-    Among equal costs, that partner wins whose place differs from the node's in the lowest bits, so that among many
-    equal nodes half choose each other. `lanes` has (WIDTH, at least count) columns of node rows; `cell` and `place` are
-    the number of each node's cell and its place in it; `largest` bounds the trace of a pair's covariance, units
-    squared; `cost` is working memory.
+    Ties as in `pair_merge.keep_cheaper`. `lanes` has (WIDTH, at least count) columns of node rows; `cell` and `place`
+    are the number of each node's cell and its place in the cell; `largest` bounds the trace of a pair's covariance,
+    units squared; `cost` is working memory.
     """
     most = f32(LARGEST_COST) if largest == NEVER else NEVER
     for i in range(count):
@@ -168,7 +166,7 @@ def find_partners_in_cells(lanes, count, cell, place, largest, cost, best, at):
         pairs = count - step
         pair_costs(lanes, 0, step, pairs, largest, cost)
         for i in range(pairs):
-            price = cost[i] if cost[i] < most else most  # also where it is not a number
+            price = cost[i] if cost[i] < most else most  # also for NaN
             cost[i] = price if cell[i] == cell[i + step] else NEVER
         for i in range(pairs):
             own, new = place[i], np.int32(place[i] + step)
@@ -193,7 +191,7 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
     cell, place, at = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
     cost, best = np.empty(size, np.float32), np.empty(size, np.float32)
     # Lists are filled without branches, which would be mispredicted: every entry is written, and overwritten by the
-    # next one unless it is kept. So they have room for one more. Indices are unsigned: numba checks signs.
+    # next entry unless it is kept, so lists have room for one more. Indices are unsigned, as numba checks signs.
     first, second = np.empty(size + 1, np.uint64), np.empty(size + 1, np.uint64)
     kept, done, ends = np.empty(size + 1, np.uint64), np.empty(size + 1, np.uint64), np.empty(size + 1, np.uint64)
     slot, joined, members = np.empty(size, np.uint64), np.empty(size, np.uint64), np.ones(size, np.int64)
@@ -246,7 +244,7 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
             cell[left], slot[left] = cell[i], own
             left += lives & again
             finished += lives & (np.uint8(1) - again)
-        # Finished nodes: without a merge, their cells would not change in another round.
+        # Finished nodes: a cell without a merge would not change in another round.
         for k in range(finished):
             i, own = done[k], ends[k]
             trace = lanes[COVARIANCE, i] + lanes[COVARIANCE + 1, i] + lanes[COVARIANCE + 2, i]
@@ -268,17 +266,17 @@ def merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row):
 
 @kernel(i8, u4[:], b1[:], out(f4[:, :]), f4, i8, out(i8[:]), out(u4[:]), ranges=True)
 def merge_in_cells(start, stop, nodes, is_first, rows, largest, made, owner, row):
-    """Merge nodes with others of their cell, and fill the rows of the nodes that become parents.
+    """Merge nodes with others of their cell, and fill the rows of the new parents.
 
-    The rows of a range are spans: SPAN nodes, but for those whose cell begins before, with the rest of the last cell.
+    The rows of a range are spans of SPAN nodes, moved forward to the borders of cells.
 
     Args:
         nodes: (n,) rows, by cell and then along a curve.
         is_first: (n,) true where a cell begins.
         rows: node rows; up to n // 2 of them, from `made` on, are filled.
         largest: largest trace of the covariance of a merged node, units squared.
-        owner: (n,) filled with the place in `nodes` of the first member of each node's family, or its own.
-        row: (n,) the row of each family is filled in at the place of its first member.
+        owner: (n,) filled with the place in `nodes` of the first member of the node's family, or its own.
+        row: (n,) filled, at the place of the first member of each family, with the row of the parent.
     """
     n = len(nodes)
     for span in range(start, stop):
@@ -293,13 +291,13 @@ def merge_in_cells(start, stop, nodes, is_first, rows, largest, made, owner, row
 
 @kernel(u4[:], i8[:], u4[:])
 def split_families(nodes, owner, row):
-    """Separate the members of families from the nodes without a parent; `owner` and `row` are of `merge_in_cells`.
+    """Separate the members of families from the roots; `owner` and `row` are of `merge_in_cells`.
 
     Returns:
-        members: (C,) the members of one family after the other, in the order of their first members.
+        members: (C,) members, family after family, in the order of the first members.
         first: (F + 1,) int64, where each family begins in `members`.
-        made: (F,) rows of the families.
-        survivors: (S,) the nodes without a parent: a family's node replaces the first of its members.
+        made: (F,) rows of the parents of the families.
+        survivors: (S,) the roots: a parent replaces the first member of its family.
     """
     n = len(nodes)
     size = np.zeros(n, np.int64)

@@ -1,4 +1,4 @@
-"""The kernels of the order of chunks: the demand for families, their division into chunks, their order in a chunk.
+"""Kernels of the order for streaming: demand for families, their division into chunks, their order within a chunk.
 
 Sets of families are split in two, again and again, until each set is a chunk. A set is a slice of `sequence`, an array
 of families, in descending order of size, parents before their children. Its *roots* are the families whose parents'
@@ -24,19 +24,18 @@ from .sort import AXIS_BITS, interleave
 AXES = 4
 SIZE = 3
 
-#: Places at which a split is tried along each axis. Chosen.
+#: Number of places of a split along each axis. Chosen.
 BINS = 128
 
-#: Up to this number of chunks, every division of them is tried; of more, those that leave a quarter on either side, so
-#: that the number of rounds stays logarithmic. Chosen.
+#: Up to this number of chunks, all divisions are tried; beyond, those with at least a quarter on either side, so that
+#: the number of rounds is logarithmic. Chosen.
 FEW_CHUNKS = 8
 
-#: When fewer nodes than this are left to fill a part, a family that would leave one is passed over, since no family of
+#: With room for fewer nodes than this in a part, a family that would leave room for one is skipped, since no family of
 #: a builder has one node. Chosen.
 NEARLY_FULL = 64
 
-
-#: Viewpoints that one pass over the families serves. Measured: 8 take half as long as one by one.
+#: Viewpoints per pass over the families. Measured: 8 take half as long as one by one.
 LANES = 8
 
 #: Buckets of pixel scales: the upper bits of a float32, 1.6 to 3.1 % wide, which cover all of its numbers above 0.
@@ -46,18 +45,18 @@ BUCKETS = 1 << (31 - BUCKET_SHIFT)
 #: Bytes that each thread takes for a family: its buckets.
 DEMAND_BYTES = 2 * LANES
 
-#: Bits of a key below its depth, and the depth from which on families keep the order that they have.
+#: Bits of a key below its depth, and the depth from which on families keep their order.
 CODE_BITS = 57
 DEEP = 63
 
 
 @fields(i4[:], i4[:], i4[:, :], u1[:, :])
 class Families(NamedTuple):
-    """The families of a tree, in descending order of size; for a kernel to read."""
+    """The families of a tree, in descending order of size."""
 
-    parent: Any  # (F,) int32, the family that has its parent; -1 for the root's
+    parent: Any  # (F,) int32, the family that contains its parent; -1 for the children of the root
     count: Any  # (F,) int32, its nodes
-    rank: Any  # (F, 3) int32, the place of its parent's centre among all, along x, y, z
+    rank: Any  # (F, 3) int32, the rank of its parent's centre along x, y, z
     demand: Any  # (F, V) uint8, of `fill_demand`
 
 
@@ -65,7 +64,7 @@ class Families(NamedTuple):
 def find_roots(families, members, number, set_of, root, weight):
     """Fill `set_of` and `root` of the members of a set, and the `weight` of its roots; return the number of roots.
 
-    `number` is that of the set, which no other set had.
+    `number` identifies the set; no earlier set may have had it.
     """
     for i in range(len(members)):
         set_of[members[i]] = number
@@ -94,7 +93,7 @@ def sum_of(values):
 
 @kernel()
 def fill_bins(families, members, root, weight, nodes, greatest):
-    """Add nodes (AXES, BINS) and greatest demands (AXES, BINS, V) of the bins of a set along each axis."""
+    """Add the families of a set to the nodes (AXES, BINS) and greatest demands (AXES, BINS, V) of bins."""
     low, high = np.full(3, len(families.count)), np.zeros(3, np.int64)
     for i in range(len(members)):
         family = members[i]
@@ -122,11 +121,11 @@ def fill_bins(families, members, root, weight, nodes, greatest):
 
 @kernel()
 def choose_split(nodes, greatest, size, chunks):
-    """Return axis (x, y, z or SIZE) and chunks of the first part of the split that is expected to save most bytes.
+    """Return the axis (x, y, z or SIZE) and the chunks of the first part of the split with the least expected cost.
 
-    A part is expected to be fetched as a whole by those who need any of it, as in the surface area heuristic of ray
-    tracing: the cost of a split is the sum over both parts of nodes x viewers, and viewers are counted by the greatest
-    demand of each viewpoint.
+    As in the surface area heuristic of ray tracing, a viewer that needs any of a part is expected to fetch it whole:
+    the cost of a split is the sum of nodes x viewers over both parts. Viewers are the sum of the greatest demands of
+    all viewpoints.
 
     Args:
         nodes, greatest: of `fill_bins`.
@@ -153,7 +152,7 @@ def choose_split(nodes, greatest, size, chunks):
             filled = min(passed // size, chunks - fewest)
             if filled <= full:
                 continue
-            # All divisions that end in this bin cost as if they went through it, unless one ends where it does.
+            # A division inside this bin counts the bin on both sides; one at its end on the first side only.
             first, second = sum_of(before), sum_of(after[at if passed > filled * size else at + 1])
             while full < filled:
                 full += 1
@@ -165,10 +164,10 @@ def choose_split(nodes, greatest, size, chunks):
 
 @kernel()
 def mark_first_part(families, members, root, weight, axis, room):
-    """Mark the families of the first part of a split, which has room for `room` nodes, by a weight of -1.
+    """Mark the families of the first part of a split, with room for `room` nodes, by a weight of -1; return if any.
 
-    Families are taken in order as long as there is room; families that do not fit are passed over, so that the room is
-    used up but for very few nodes. In a split by size each family becomes its own root. Returns whether any was marked.
+    Families are taken in order while there is room; families that do not fit are skipped, so that nearly all of the
+    room is used. In a split by size each family becomes its own root.
     """
     marked = False
     if axis == SIZE:
@@ -202,7 +201,7 @@ def mark_first_part(families, members, root, weight, axis, room):
 
 @kernel()
 def move_first_part(members, root, weight, spare):
-    """Move the marked families to the beginning; both parts keep their order. Return how many are marked."""
+    """Move the marked families to the front, both parts in their order; return the number of marked families."""
     length, rest = 0, 0
     for i in range(len(members)):
         family = members[i]
@@ -219,11 +218,11 @@ def move_first_part(members, root, weight, spare):
 
 @kernel(i8, Families, i8[:, :], out(i4[:]), out(i4[:]), out(i4[:]), out(i8[:]), out(i4[:]), out(i8[:]), ranges=True)
 def split_sets(start, stop, families, sets, sequence, set_of, root, weight, spare, lengths):
-    """Split each set in two; the first part of each fills whole chunks, but for very few nodes.
+    """Split each set in two; the first part fills whole chunks, up to very few nodes.
 
     Args:
         sets: (S, 6) begin and end in `sequence`; a number that no set had before; nodes of a chunk; number of chunks
-            that the set fills; nodes that the first part has room for if it is to be split by size, or 0.
+            that the set fills; room of the first part for a split by size, nodes, or 0 for any split.
         sequence: (F,) reordered within each set.
         set_of, root, weight, spare: (F,) working memory.
         lengths: (S,) filled with the number of families of each first part.
@@ -241,14 +240,14 @@ def split_sets(start, stop, families, sets, sequence, set_of, root, weight, spar
             axis, share = choose_split(nodes, greatest, size, chunks)
             room = share * size
         if roots == 1 or not mark_first_part(families, members, root, weight, axis, room):
-            axis = SIZE  # a variable, since the constant has a type of its own, which is compiled once more
+            axis = SIZE  # a variable, since the constant has its own type, which would be compiled once more
             mark_first_part(families, members, root, weight, axis, room)
         lengths[i] = move_first_part(members, root, weight, spare[begin:end])
 
 
 @kernel(i8, NODES, i4[:], VIEWS, f8, f8, out(u1[:, :]), ranges=True)
 def fill_demand(start, stop, families, parent, views, least, most, demand):
-    """Fill the chance that a viewer at each viewpoint refines a family's parent, if its budget is unknown.
+    """Fill the probability that a viewer of unknown budget at each viewpoint refines a family's parent.
 
     A viewer refines the largest nodes first. It needs a family if its budget has room for all families whose pixel
     scale, limited by those of their ancestors, is at least as large. The logarithm of budgets is uniform between
@@ -256,9 +255,9 @@ def fill_demand(start, stop, families, parent, views, least, most, demand):
 
     Args:
         families: (F,) the parents of families, parents before their children.
-        parent: (F,) the family to which each parent belongs; -1 for the root.
+        parent: (F,) the family that contains each parent; -1 for the root.
         views: (V,), a multiple of `LANES`.
-        demand: (F, V) filled: 255 for certain. No family has more than its parent.
+        demand: (F, V) filled, 255 for a probability of 1; never more than that of the parent's family.
     """
     span = math.log(most / least)
     bucket = np.empty((len(families), LANES), np.int16)
@@ -269,7 +268,7 @@ def fill_demand(start, stop, families, parent, views, least, most, demand):
             above = parent[family]
             for lane in range(LANES):
                 scale = pixel_scale(families[family], views[first + lane])
-                if not scale >= ZERO:  # also not a number
+                if not scale >= ZERO:  # also NaN
                     scale = ZERO
                 at = np.float32(scale).view(np.int32) >> BUCKET_SHIFT
                 if above >= 0:  # buckets ascend as scales do, so that the least one has the least bucket
@@ -289,17 +288,16 @@ def fill_demand(start, stop, families, parent, views, least, most, demand):
 
 @kernel(i8, i8[:], i4[:], i4[:, :], i8, out(i4[:]), out(i4[:]), out(i4[:]), ranges=True)
 def sort_within_chunks(start, stop, bounds, parent, rank, axis_bits, sequence, chunk_of, depth):
-    """Sort the families of each chunk by the depth within it, then along a Morton curve.
+    """Sort the families of each chunk by their depth within the chunk, then along a Morton curve.
 
-    Neighbours in space have similar centres and colours, which makes them smaller to compress; parents stay before
-    their children.
+    Neighbours in space have similar centres and colours, so they compress better; parents stay before their children.
 
     Args:
         bounds: (C + 1,) where each chunk begins in `sequence`, and the end.
         parent, rank: of `Families`.
         axis_bits: bits of the greatest rank.
         sequence: (F,) families, parents first; reordered.
-        chunk_of: (F,) of no chunk's number; filled. Another thread may not have reached the parent's chunk yet.
+        chunk_of: (F,) filled; must have no chunk's number before, as other threads may not have filled theirs yet.
         depth: (F,) working memory.
     """
     up, down = np.uint64(max(AXIS_BITS - axis_bits, 0)), np.uint64(max(axis_bits - AXIS_BITS, 0))

@@ -13,12 +13,12 @@ from .pixel_scale import INFINITE, NODES, VIEWS, ZERO, pixel_scale
 BUCKET_BITS = 16
 BUCKETS = 1 << (31 - BUCKET_BITS)
 
-#: Pixel scales are compared as the bits of a float32 >= 0, which are in the order of the numbers. NaN is the largest,
-#: as in Spark. The sign bit marks leaves, which makes them less than any threshold.
+#: Pixel scales are compared as the bits of a float32 >= 0, whose order is that of the numbers. NaN is the largest, as
+#: in Spark. The sign bit marks leaves, which makes them smaller than any threshold.
 INFINITE_BITS = INFINITE.view(np.int32)
 LEAF = np.int32(-(1 << 31))
 
-#: Why a cut has no more nodes. FULL: the slots did not suffice, and there is no cut.
+#: Reasons why a cut has no more nodes. FULL: the slots did not suffice, and there is no cut.
 BUDGET, PIXEL, MISSING, EXHAUSTED, FULL = 0, 1, 2, 3, 4
 
 #: Entries of `Slots.tally`: slots in use; refined nodes; pending ones; roots; nodes of the cut once all of bucket LOW
@@ -119,20 +119,20 @@ FIRST_STEP = np.float32(1 / 8)
 
 @kernel(Trees, Stop, f4, out(Slots), out(f4[:]), out(CutNodes), nogil=True)
 def find_cut(trees, stop, guess, slots, demand, cut):
-    """Refine the node with the largest pixel scale, as long as that is above `stop.smallest` and the budget allows it.
+    """Find the cut: refine the node with the largest pixel scale while it is above `stop.smallest` and within budget.
 
     The cut is that of a queue ordered by (pixel scale, instance, index), the greatest first, but it is found by
-    thresholds. The queue takes out a node when all that are left are at or below its *limit*, the least pixel scale on
-    the path from the root to it. So all nodes with a limit above a threshold are refined, in the order in which they
-    are in memory, and the threshold is lowered until their number is what the budget allows. If they are more, it is
-    raised again: `slots.sums` has the number of nodes that each bucket of limits added. Only the bucket in which the
-    budget ends is refined in the order of the queue. A node that would exceed the budget ends the cut whether or not
-    its children are resident.
+    thresholds. The queue takes out a node once all others in it are at or below its *limit*, the least pixel scale on
+    the path from the root to it. So all nodes with a limit above a threshold are refined, in memory order, and the
+    threshold is lowered until the budget is used up. If there are too many nodes, the threshold is raised again:
+    `slots.sums` has the number of nodes that each bucket of limits added. Only the bucket in which the budget ends is
+    refined in the order of the queue. A node that would exceed the budget ends the cut, even if its children are not
+    resident.
 
     Args:
         guess: the first threshold, such as the last cut's, or 0; the cut does not depend on it.
-        demand: (chunks,) of all trees, filled: the largest limit of the nodes that are, or should be, refined and have
-            children in the chunk; 0 without such nodes.
+        demand: (chunks,) of all trees, filled with the largest limit of the nodes with children in the chunk that are
+            refined, or would be if these were resident; 0 without such nodes.
         cut: room for more than `stop.budget` nodes, filled.
 
     Returns:
@@ -141,7 +141,7 @@ def find_cut(trees, stop, guess, slots, demand, cut):
         missing: number of roots that are not resident, and of nodes in the cut whose children would be refined if
             resident.
         least: the least limit of a refined node; infinite if none was refined.
-        last: the slot of the node that would have exceeded the budget, or -1.
+        last: the slot of the node that would have exceeded the budget; -1 for none.
     """
     tally = slots.tally
     largest = visit_roots(trees, stop, slots)
@@ -155,7 +155,7 @@ def find_cut(trees, stop, guess, slots, demand, cut):
         if tally[DRAWN] > stop.budget or done:
             break
         threshold = lowered(slots, threshold, stop.budget)
-    low = tally[LOW] if tally[DRAWN] > stop.budget else -1  # -1: nothing was refined in vain
+    low = tally[LOW] if tally[DRAWN] > stop.budget else -1  # -1: the budget suffices for all refined nodes
     bucket = low
     if tally[GAPS]:
         sum_from_top(slots, low)
@@ -170,7 +170,7 @@ def find_cut(trees, stop, guess, slots, demand, cut):
 
 @kernel(nogil=True)
 def sum_from_top(slots, low):
-    """Turn `slots.sums` above a bucket into the number of nodes of the cut when all down to a bucket are refined."""
+    """Replace `slots.sums` above bucket `low` by the size of the cut that refines this bucket and all larger ones."""
     total = slots.first[0]
     for bucket in range(BUCKETS - 1, low, -1):
         total += slots.sums[bucket]
@@ -179,11 +179,11 @@ def sum_from_top(slots, low):
 
 @kernel(nogil=True)
 def stopping_bucket(trees, slots, budget, low, below):
-    """Return the next bucket below `below` in which the budget may end: of a node with missing children, or else `low`.
+    """Return the next bucket below `below` in which the budget may end: that of a node with missing children, or `low`.
 
-    As in Spark, refinement also ends at a node whose children would exceed the budget but are not resident. They are in
-    no sum. So the budget may end in a bucket where it does not suffice for all that the bucket adds and such children.
-    `slots` are those that `sum_from_top` filled; resident nodes exceed the budget in bucket `low`, -1 if they do not.
+    As in Spark, refinement also ends at a node whose children would exceed the budget but are not resident. No sum
+    contains such children. So the budget may end in a bucket where it does not suffice for the sum and these children.
+    `slots` are those of `sum_from_top`; resident nodes exceed the budget in bucket `low`, -1 if they do not.
     """
     nodes, views, _, _ = trees
     node, limit, instance, first, queue, _, _, sums, tally = slots
@@ -200,10 +200,10 @@ def stopping_bucket(trees, slots, budget, low, below):
 
 @kernel(nogil=True)
 def collect(trees, stop, slots, demand, cut, low):
-    """Collect the nodes of the cut when all nodes of the buckets above `low` are refined, and none of `low`.
+    """Collect the nodes of the cut that refines the buckets above `low`, but not `low` itself.
 
-    `low` is the bucket in which the budget may end, -1 if it does not; `slots.heap` gets the slots of its nodes, for
-    `finish`.
+    `low` is the bucket in which the budget may end, -1 if it suffices; fills `slots.heap` with the slots of the nodes
+    of this bucket, for `finish`.
 
     Returns:
         numbers of collected nodes, of nodes in `heap`, and of nodes whose children are missing; whether a node
@@ -221,7 +221,7 @@ def collect(trees, stop, slots, demand, cut, low):
             limit[at] |= LEAF if limit[at] >> BUCKET_BITS > low else 0
     selected, queued, missing, small = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     least = INFINITE_BITS
-    # Nodes from `bottom` on go through the queue, those from `top` on are refined before that.
+    # Nodes from `bottom` on go through the queue, nodes from `top` on are refined before.
     bottom, top = max(np.int64(smallest) + 1, low << BUCKET_BITS), max(np.int64(smallest) + 1, (low + 1) << BUCKET_BITS)
     for run in range(-1, runs):
         start, end = np.int64(0), np.int64(first[0])
@@ -241,7 +241,7 @@ def collect(trees, stop, slots, demand, cut, low):
             request_chunks(demand, trees, view, np.int64(node[start]), end - start, from_bits(bits))
             least = min(least, bits)
         for at in range(start, end):
-            # Branch-free where it cannot be predicted: each node is written to the cut, and stays there if it is drawn.
+            # Without unpredictable branches: each node is written to the cut, and overwritten unless it is drawn.
             bits = limit[at] & ~LEAF
             below, above = bits < bottom, bits >= top
             is_leaf = limit[at] < 0
@@ -258,16 +258,16 @@ def collect(trees, stop, slots, demand, cut, low):
 def finish(trees, stop, slots, demand, cut, low, collected):
     """Add the nodes of bucket `low`, refined in the order of the queue, to the nodes of `collect`.
 
-    Nodes that are in the bucket from the start have their own pixel scale as their limit, since their parents are in a
-    larger bucket. Children of one of them are queued by their own pixel scale, too, with their limit kept apart. Leaves
-    that are there from the start stay out of the queue, which is faster: those among them count as taken out that come
-    before the least node that was.
+    The limits of the initial nodes of the bucket are their own pixel scales, since their parents are in a larger
+    bucket. Their children are queued by their own pixel scales, too; `slots.pending` has their limits. Initial leaves
+    stay out of the queue, which is faster: the leaves that come before the least node taken out count as taken out,
+    too.
 
     Args:
         collected: result of `collect`.
 
     Returns:
-        as `find_cut`; `last` is -1 if the budget does not end in this bucket, and there is no cut unless `low` is -1.
+        as `find_cut`; if `last` is -1, the budget does not end in this bucket, and there is no cut unless `low` is -1.
     """
     nodes, views, _, _ = trees
     smallest, budget = stop
@@ -349,23 +349,23 @@ OWN_AHEAD, CHILDREN_AHEAD = 16, 6
 #: Nodes of 24 bytes in a cache line of 64, rounded up.
 LINE_NODES = 3
 
-#: Least and most share to which a round lowers the threshold. The cut does not depend on them: lowering it too far
-#: costs visits of nodes that are not refined, and too little costs rounds.
+#: Least and largest factor by which a round lowers the threshold. The cut does not depend on them: a smaller factor
+#: costs visits of nodes that are not refined, a larger one costs rounds.
 LEAST_STEP, MOST_STEP = 1 / 8, 0.95
 
-#: Buckets in which pixel scales double.
+#: Number of buckets over which pixel scales double.
 OCTAVE = 1 << (23 - BUCKET_BITS)
 
-#: Least and most power of 1 / threshold to which the number of nodes is taken to grow; -2 where splats cover surfaces.
+#: Bounds of the estimated power of 1 / threshold with which the number of nodes grows; 2 where splats cover surfaces.
 LEAST_POWER, MOST_POWER = 0.5, 4.0
 
-#: Share by which a threshold is lowered beyond the estimate, since a few nodes too many cost less than another round.
+#: Further factor of a lowered threshold, since a few nodes too many cost less than another round.
 BEYOND = 0.98
 
 
 @kernel(nogil=True)
 def visit_roots(trees, stop, slots):
-    """Put the resident roots into the slots; returns the bits of the largest limit."""
+    """Put the resident roots into the slots; return the bits of the largest limit."""
     nodes, views, resident, _ = trees
     node, limit, instance, _, _, pending, _, sums, tally = slots
     sums[:] = 0
@@ -388,9 +388,9 @@ def visit_roots(trees, stop, slots):
 
 @kernel(nogil=True)
 def refine(trees, stop, slots, threshold):
-    """Refine the nodes with a limit above a threshold, in the order in which they are in memory; update `slots.tally`.
+    """Refine the nodes with a limit above a threshold, in memory order; update `slots.tally`.
 
-    Where they come to more than the budget, the threshold is raised, to the bucket in which that happens.
+    If the nodes exceed the budget, the threshold rises to the bucket in which the budget ends.
     """
     nodes, views, _, _ = trees
     smallest, budget = stop
@@ -420,7 +420,7 @@ def refine(trees, stop, slots, threshold):
         done += 1
         above = limit[at]
         bucket = above >> BUCKET_BITS
-        if bucket < low:  # the threshold has been raised since
+        if bucket < low:  # the threshold has risen since
             pending[left] = at
             left += 1
             continue
@@ -449,7 +449,7 @@ def refine(trees, stop, slots, threshold):
             node[count] = child
             limit[count] = own
             instance[count] = number
-            # Branch-free, as the branches could not be predicted.
+            # Branch-free, as branches would be unpredictable.
             can_refine = own > smallest
             due = own >> BUCKET_BITS >= low
             queue[ready] = count
@@ -464,9 +464,9 @@ def refine(trees, stop, slots, threshold):
 
 @kernel(nogil=True)
 def lowered(slots, threshold, budget):
-    """Return the next threshold, at which the cut is likely to have a little more than `budget` nodes.
+    """Return the next threshold, whose cut probably has slightly more than `budget` nodes.
 
-    `threshold` is the last one; the nodes refined down to it are fewer than `budget`.
+    The cut of the last threshold, `threshold`, has fewer.
     """
     # The number of nodes grows as a power of 1 / threshold, which is estimated by the last octave.
     drawn = slots.tally[DRAWN]
@@ -496,7 +496,7 @@ def comes_before(node, limit, instance, a, b):
 
 @kernel(nogil=True)
 def sift_up(node, limit, instance, heap, at):
-    """Move the heap's entry at `at` up to where the heap is in order."""
+    """Move the heap's entry at `at` up to restore the order of the heap."""
     while at > 0:
         above = (at - 1) >> 1
         if not comes_before(node, limit, instance, heap[at], heap[above]):
@@ -507,7 +507,7 @@ def sift_up(node, limit, instance, heap, at):
 
 @kernel(nogil=True)
 def sift_down(node, limit, instance, heap, length):
-    """Move the heap's first entry down to where the heap is in order."""
+    """Move the heap's first entry down to restore the order of the heap."""
     at = 0
     while True:
         child = 2 * at + 1

@@ -1,4 +1,4 @@
-"""Statistics of a cut, and the nodes that it shares with another."""
+"""Statistics of a cut, and the number of nodes that it shares with another cut."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from ...system.jit import f4, f8, fields, i4, i8, kernel, out, prefetch, u2, u4
 from .cut import BUCKET_BITS, BUCKETS, LEAF, CutNodes
 from .pixel_scale import NEAREST, NODES, ONE, VIEWS, ZERO
 
-#: Columns of the counts of an instance: nodes of each kind; least, sum and largest of their depths; area covered.
+#: Columns of the counts of an instance: nodes of each kind; least, sum and largest depth; covered area.
 SELECTED, LEAVES, FRONTIER, IN_FRUSTUM, OUTSIDE, BEHIND, DEPTH_MIN, DEPTH_SUM, DEPTH_MAX, AREA = range(10)
 COUNTS = 10
 
-#: Areas are summed as whole numbers of 1/1024 square pixel, so that the sum does not depend on the order.
+#: Areas are summed as integers, in units of 1/1024 square pixel, so that the sum does not depend on the order.
 AREA_PARTS = 1024
 
-#: Nodes that are measured together: few enough for a block of them to stay in the processor's cache.
+#: Nodes of a block: few enough for the processor's cache.
 BLOCK_NODES = 512
 
 #: Nodes ahead of the one being read that are fetched into the processor's cache. Chosen.
 AHEAD = 64
 
-#: Bits are cleared all together rather than one by one if there are fewer words than this many times the nodes. Chosen.
+#: All words of bits are cleared, not single bits, if there are fewer words than this many times the nodes. Chosen.
 CLEAR_WORDS = 4
 
 
@@ -40,7 +40,7 @@ class Screen(NamedTuple):
 
 @kernel(NODES, i4[:], VIEWS, CutNodes, Screen, out(i8[:, :]), out(f4[:]), out(u2[:]), nogil=True)
 def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
-    """Count the nodes of a cut by where their centres are, and measure those inside the frustum; return their number.
+    """Count the nodes of a cut inside, outside and behind the frustum, and measure those inside; return their number.
 
     Args:
         depths: (nodes,) edges from the root, of all trees.
@@ -56,8 +56,7 @@ def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
     z, size = np.empty(BLOCK_NODES, np.float32), np.empty(BLOCK_NODES, np.float32)
     found, begin = 0, 0
     while begin < len(node):
-        # A block is of nodes of an instance that follow one another. They are copied together first, so that the
-        # arithmetic is done on several at a time.
+        # A block has successive nodes of an instance. They are first copied side by side, for vectorized arithmetic.
         number = instance[begin]
         end, last = begin + 1, min(begin + BLOCK_NODES, len(node))
         while end < last and instance[end] == number:
@@ -75,7 +74,7 @@ def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
             to = at - begin
             x[to], y[to], z[to], size[to] = record.x, record.y, record.z, record.size
             leaves += record.child_count == 0
-            frontier += limit[at] >= 0  # without nodes that the queue has taken out
+            frontier += limit[at] >= 0  # without nodes taken out by the queue
             depth = np.int64(depths[index])
             least, most = min(least, depth), max(most, depth)
             total += depth
@@ -98,7 +97,7 @@ def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
 
 @kernel(nogil=True)
 def measure_block(x, y, z, size, count, view, screen):
-    """Replace (BLOCK_NODES,) sizes by feature sizes in pixels, -1 of splats whose centres are not inside the frustum.
+    """Replace (BLOCK_NODES,) sizes by feature sizes in pixels; -1 for splats with centres not inside the frustum.
 
     Returns:
         number of splats inside the frustum, number behind the camera, area of those inside in 1 / AREA_PARTS square
@@ -130,8 +129,8 @@ def measure_block(x, y, z, size, count, view, screen):
 
 @kernel(f4[:], i8[:], out(f4[:]), nogil=True)
 def select(values, places, found):
-    """Fill the values, all at least 0, that would be at some ascending places if all were in ascending order."""
-    # The upper halves of their bits put them into buckets; only the buckets that are asked for are sorted.
+    """Fill the order statistics of values, all at least 0, at ascending places."""
+    # Values are counted in buckets by the upper halves of their bits; only the requested buckets are sorted.
     bits = values.view(np.int32)
     ends = np.zeros(BUCKETS, np.int32)
     for at in range(len(values)):
@@ -157,7 +156,7 @@ def select(values, places, found):
 
 @kernel(out(u4[:]), out(u4[:]), i8[:], u4[:], u2[:], u4[:], u2[:], out(i8[:, :]), nogil=True)
 def replace_drawn(drawn, before, base, node, instance, old_node, old_instance, counts):
-    """Fill (instances, 2) counts: the nodes of a cut, and the nodes that it shares with the cut before.
+    """Fill (instances, 2) counts: the nodes of a cut, and the nodes shared with the cut before.
 
     Args:
         drawn: words of zeros, a bit for each node of each instance; filled with the nodes of the cut.

@@ -1,12 +1,12 @@
 """Surfaces, bounds and covariances of splats, the axes of covariances, and opacity profiles of merged splats.
 
-Eigenvalues and eigenvectors are found by cyclic Jacobi rotations. Unlike the closed form, Jacobi's method keeps the
-eigenvectors of flat, needle-like and spherical matrices. Eigenvectors are returned as the quaternion of the product of
-its rotations, so they are right-handed by construction. Matrices lie side by side, one row per element, and every step
-is branch-free, so that LLVM vectorizes over matrices.
+Eigenvalues and eigenvectors are found by cyclic Jacobi rotations. Unlike the closed form, Jacobi's method is exact for
+flat, needle-like and spherical matrices. Eigenvectors are returned as the quaternion of the product of the rotations,
+so they are right-handed by construction. Matrices are stored side by side, one row per element, and every step is
+branch-free, so that LLVM vectorizes over matrices.
 
-Spark draws a splat of linear opacity A > 1 with the alpha 1 - (1 - exp(-t)) ** A, t = z^2 / 2, which is that of A equal
-splats on top of each other. Its coverage, the integral over the plane, is 2 pi sigma^2 * H(A), where H(A) is the
+Spark draws a splat of linear opacity A > 1 with the alpha 1 - (1 - exp(-t)) ** A, t = z^2 / 2: that of A equal splats
+on top of each other. Its coverage, the integral over the plane, is 2 pi sigma^2 * H(A), where H(A) is the
 harmonic number 1 + 1/2 + ... + 1/A. Its variance along an axis is sigma^2 * (H(A) + H2(A) / H(A)) / 2, with H2(A) = 1 +
 1/4 + ... + 1/A^2. Both follow from integration by parts; for A up to 1 they are 2 pi sigma^2 * A and sigma^2.
 
@@ -27,7 +27,7 @@ from ...model.falloff import harmonic
 from ...model.gaussian import MIN_OPACITY, SIZE_PER_D, THOMSEN_P, linear_opacity
 from ...system.jit import f4, f8, fields, i8, kernel, out
 
-#: The largest float32, world units: centres and scales of merged splats are clamped to it.
+#: Largest float32, world units, to which centres and scales of merged splats are clamped.
 LARGEST = float(np.finfo(np.float32).max)
 
 #: Least semi-axis of `ellipsoid_area`, as a share of the longest: far below any needle in a file, and its power is a
@@ -35,19 +35,19 @@ LARGEST = float(np.finfo(np.float32).max)
 AXIS_FLOOR = np.float32(1e-20)
 THOMSEN_P32, THOMSEN_ROOT, THIRD = np.float32(THOMSEN_P), np.float32(1 / THOMSEN_P), np.float32(1 / 3)
 
-#: Least scale of a merged splat, world units: a scale of 0 has no logarithm, which PLY and SPZ store. Chosen.
+#: Least scale of a merged splat, world units, as PLY and SPZ store logarithms. Chosen.
 SCALE_FLOOR = 1e-30
 rotation_matrix = kernel(inline=True)(gaussian.rotation_matrix)
 
-#: Sweeps over the three off-diagonal elements of every matrix; they usually suffice, as Jacobi's method converges
-#: quadratically. Of 68,802 merges of two real scenes, 2 % need all 4 of them, and none needs more.
+#: Sweeps over the three off-diagonal elements of every matrix. They usually suffice, as Jacobi's method converges
+#: quadratically: of 68,802 merges of two real scenes, 2 % need all 4, and none needs more.
 SURE_SWEEPS = 4
 
 #: Most sweeps of a matrix, if it does not converge before.
 MAX_SWEEPS = 16
 
-#: Converged: sum of squares of the off-diagonal elements, of a matrix whose largest diagonal element is 1. An error of
-#: 1e-9 is far below float32's 6e-8, which eigenvalues and vectors are rounded to. Chosen.
+#: Largest sum of squares of the off-diagonal elements of a converged matrix, whose largest diagonal element is 1. An
+#: error of 1e-9 is far below the 6e-8 of float32, to which eigenvalues and vectors are rounded. Chosen.
 CONVERGED = 1e-18
 
 #: Rows of the array of matrices: xx yy zz, xy xz yz, and x y z w of the quaternion.
@@ -66,9 +66,9 @@ class SplatColumns(NamedTuple):
 
 @kernel()
 def ellipsoid_area(a, b, c):
-    """Return surface area of an ellipsoid with semi-axes a, b, c, by Knud Thomsen's formula.
+    """Return the surface area of an ellipsoid with semi-axes a, b, c, not all 0, by Knud Thomsen's formula.
 
-    Not all of them may be 0. A semi-axis counts as at least AXIS_FLOOR of the longest, so that needles have an area.
+    Semi-axes are at least AXIS_FLOOR of the longest, so that needles have an area.
     """
     largest = max(a, b, c)
     smallest = min(a, b, c)
@@ -82,7 +82,7 @@ def ellipsoid_area(a, b, c):
 
 @kernel(i8, f4[:, :], f4[:, :], out(f8[:, :]), out(f8[:, :]), ranges=True)
 def find_bounds(start, stop, center, scale, low, high):
-    """Fill (blocks, 4) least and greatest x, y, z and largest scale of each of the blocks of splats."""
+    """Fill (blocks, 4) least and greatest x, y, z and largest scale of the splats of each block."""
     n, blocks = len(center), len(low)
     for c in range(start, stop):
         x0 = y0 = z0 = s0 = np.float32(np.inf)
@@ -97,7 +97,7 @@ def find_bounds(start, stop, center, scale, low, high):
 
 @kernel()
 def covariance(a, b, c, x, y, z, w):
-    """xx, yy, zz, xy, xz, yz of R diag(a^2, b^2, c^2) R^T, of scales a, b, c and a unit quaternion in float64."""
+    """Return xx, yy, zz, xy, xz, yz of R diag(a^2, b^2, c^2) R^T, by scales a, b, c and a unit quaternion, float64."""
     a, b, c = a * a, b * b, c * c
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation_matrix(x, y, z, w, 1.0)
     return (
@@ -112,11 +112,11 @@ def covariance(a, b, c, x, y, z, w):
 
 @kernel()
 def decompose(m, count):
-    """Replace the first `count` columns of `m` by their eigenvalues and eigenvectors.
+    """Replace matrices, the first `count` columns of `m`, by their eigenvalues and eigenvectors.
 
-    The result for a matrix does not depend on those beside it, to the last bit. Of (ROWS, at least count) `m`, rows 0
-    to 5 are xx, yy, zz, xy, xz, yz on entry. On return, rows 0 to 2 are the eigenvalues, and rows 6 to 9 the rotation
-    from their axes to the world's, a unit quaternion x y z w.
+    The result for a matrix does not depend on the other matrices, to the last bit. Rows 0 to 5 of `m`, (ROWS, at least
+    count), are xx, yy, zz, xy, xz, yz on entry. On return, rows 0 to 2 are the eigenvalues, and rows 6 to 9 the
+    rotation from the eigenvectors to the world's axes, a unit quaternion x y z w.
     """
     scale = np.empty(count, np.float64)
     for i in range(count):
@@ -177,12 +177,12 @@ def rotation(p, q, off):
     return s / c, c, s, half_c, s / (2 * half_c)
 
 
-#: The largest D of a merged splat; a sharper profile gains nothing (benchmarks/notes/quality-builder.md). A splat
-#: whose density is higher than that of this profile is drawn larger instead.
+#: Largest D of a merged splat; sharper profiles gain nothing (benchmarks/notes/quality-builder.md). A splat of higher
+#: density than this profile is drawn larger instead.
 MAX_D = 2.5
 
-#: The same for needles, whose second axis is shorter than this share of the longest. They may be thinner than a pixel,
-#: where the blur of the rasterizer takes more from a sharp profile than from the splats that it replaces: wires would
+#: Largest ratio of the second axis to the longest of a needle, and the largest D of needles. They may be thinner than a
+#: pixel, where the blur of the rasterizer takes more from a sharp profile than from the original splats: wires would
 #: fade. Measured; between 0.25 and 0.4, and between 1.5 and 1.75, little changes
 #: (benchmarks/notes/quality-builder.md).
 NEEDLE, NEEDLE_D = 0.25, 1.5
@@ -216,9 +216,9 @@ def is_needle(a, b, c):
 
 @kernel(inline=True)
 def profile_of(density, needle):
-    """Return linear opacity and spread of a splat, or a needle, of a density; its variance is spread * sigma^2.
+    """Return linear opacity and spread (variance / sigma^2) of a splat, or a needle, by its density.
 
-    Above the density of the largest D the spread is smaller than the profile's: a larger sigma keeps the coverage.
+    Above the density of the largest D, the spread is smaller than the profile's: a larger sigma keeps the coverage.
     """
     if density <= 1:
         return max(density, MIN_OPACITY), 1.0
@@ -237,5 +237,5 @@ def profile_of(density, needle):
 
 @kernel(inline=True)
 def size_factor(opacity):
-    """Feature size over 2 * mean(scale) of a splat of linear opacity, float64; see `gaussian.size_factor`."""
+    """Return the ratio of feature size to 2 * mean(scale) by linear opacity, float64; see `gaussian.size_factor`."""
     return 1 + SIZE_PER_D * (lod_opacity_above_1(opacity, 1.0, math.e) - 1) if opacity > 1 else 1.0

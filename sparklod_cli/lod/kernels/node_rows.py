@@ -30,21 +30,21 @@ from .sort import interleave
 #: Bits per axis of a node's Morton code: 39 bits are sorted in four passes. Chosen.
 CURVE_BITS = 13
 
-#: Nodes whose merged splats are decomposed side by side, a sixth of them or more; results do not depend on it.
+#: Nodes of a block, of whose merged splats, a sixth or more, the covariances are decomposed side by side; results do
+#: not depend on it.
 BLOCK = 256
 
-#: Splats ahead whose columns are fetched, as they lie anywhere in them: then their cache misses overlap. Measured.
+#: Distance of prefetched splats, which lie anywhere in the columns, so that cache misses overlap. Measured.
 AHEAD = 8
 
-#: Bound of colours in the cost of pairs, so that float32 holds their squares times a coverage. Chosen; far beyond any
-#: display.
+#: Bound of colours in the cost of pairs, so that float32 holds their squares times a coverage. Chosen: far beyond
+#: displayed colours.
 MAX_COLOR = np.float32(1e3)
 
 #: Least coverage and least size of a leaf, in the builder's unit (squared), so that both have logarithms. Chosen.
 LEAST = np.float32(1e-30)
 
-
-#: Leaves ahead whose input is fetched, as they lie anywhere in it: then their cache misses overlap. Measured.
+#: Distance of prefetched leaves in `fill_leaves`. Measured.
 LEAVES_AHEAD = 16
 
 #: float32 of a cache line.
@@ -61,7 +61,7 @@ class Space(NamedTuple):
 
 @kernel(i8, u4[:], SplatColumns, f4[:, :], Space, out(f4[:, :]), out(f4[:]), ranges=True)
 def fill_leaf_rows(start, stop, index, splats, rgb, space, rows, size):
-    """Fill row i, and its feature size in units, from splat index[i]; `rgb` (N, 3) is that of the splats."""
+    """Fill row i, and its feature size in units, from splat index[i]; `rgb` (N, 3) are the colours of the splats."""
     center, scale, quat, opacity = splats
     middle, unit = space
     for i in range(start, stop):
@@ -92,7 +92,7 @@ def fill_leaf_rows(start, stop, index, splats, rgb, space, rows, size):
 
 @kernel(i8, u4[:], u4[:], i8, out(u4[:]), ranges=True)
 def fill_rows_of(start, stop, nodes, row, leaves, found):
-    """Fill the rows of nodes: a leaf's is its own."""
+    """Fill the numbers of the rows of nodes; leaf k has row k."""
     for i in range(start, stop):
         node = nodes[np.uint64(i)]
         found[np.uint64(i)] = node if node < leaves else row[np.uint64(node - leaves)]
@@ -100,9 +100,9 @@ def fill_rows_of(start, stop, nodes, row, leaves, found):
 
 @kernel(i8, f4[:, :], u4[:], f8[:], f8, out(u8[:]), ranges=True)
 def fill_morton_keys(start, stop, rows, nodes, low, step, keys):
-    """Fill the Morton codes of nodes, of CURVE_BITS per axis; centres outside the curve's box are clamped to it.
+    """Fill the Morton codes of nodes, with CURVE_BITS per axis; centres outside the curve's box are clamped to it.
 
-    `low` (3,) is the lowest corner of the box and `step` the edge of a cell, units; of `rows` only the first columns,
+    `low` (3,) is the lowest corner of the box and `step` the edge of a cell, units; only the first columns of `rows`,
     the centre, are read.
     """
     most = float((1 << CURVE_BITS) - 1)
@@ -116,7 +116,7 @@ def fill_morton_keys(start, stop, rows, nodes, low, step, keys):
 
 @kernel(i8, u4[:], i8, u4[:], f4[:, :], Space, out(f4[:, :]), out(f4[:, :]), out(f4[:, :]), out(f4[:]), ranges=True)
 def fill_merged_splats(start, stop, order, leaves, row, rows, space, center, scale, quat, opacity):
-    """Fill the columns of M splats with the geometry of merged ones in final order; leaves are left as they are."""
+    """Fill the geometry of merged splats into columns of M splats in final order; rows of leaves do not change."""
     middle, unit = space
     moments = np.empty((ROWS, BLOCK), np.float64)
     found, source = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
@@ -146,7 +146,7 @@ def fill_merged_splats(start, stop, order, leaves, row, rows, space, center, sca
 
 @kernel(i8, u4[:], u4[:], f4[:, :], out(f4[:, :]), ranges=True)
 def fill_leaves(start, stop, order, index, column, out):
-    """Fill the leaves of `out` (M, J) from `column` (n, J) in final order; rows of merged nodes are left alone."""
+    """Fill the leaves of `out` (M, J), in final order, from `column` (n, J); rows of merged nodes do not change."""
     n, width, flat = len(order), column.shape[1], column.reshape(-1)
     for i in range(start, stop):
         ahead = order[min(i + LEAVES_AHEAD, n - 1)]
@@ -167,7 +167,7 @@ def fill_leaves(start, stop, order, index, column, out):
     ranges=True,
 )
 def merge_colors(start, stop, parents, child_start, child_count, order, weight, color):
-    """Fill the colours of nodes with the weighted mean of their children's, which must be filled already.
+    """Fill the colours of nodes with the weighted means of their children's, which must be filled already.
 
     Args:
         parents: (G,) final indices of the nodes.

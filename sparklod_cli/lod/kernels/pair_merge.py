@@ -7,10 +7,10 @@ Pairs are the cheapest of neighbours along a curve: `nodes` (n,) are indices of 
 `partner` and the costs are (n,), too.
 
 Coverage is opacity integrated over the plane of projection. The coverage of a union is the sum of the two coverages
-less that of the overlap, and the same holds for first and second moments. Of flat nodes, which lie in layers, a part of
-the overlap counts nevertheless, so that their neighbours overlap, too. The overlap's moments are those of the
-product of the two Gaussians in space. The overlap, and how much the picture of a merged node differs from that of its
-two, are integrals of products of Gaussians on the planes of the three axes.
+less that of the overlap, and the same holds for first and second moments. A part of the overlap of flat nodes, which
+lie in layers, is kept, so that neighbours in a layer overlap, too. The moments of the overlap are those of the product
+of the two Gaussians in space. The overlap, and the difference between the pictures of a merged node and of its two
+nodes, are integrals of products of Gaussians on the planes of the three axes.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ LANES = 14
 #: Nodes in a block: its columns, 30 KB, stay in the first-level cache. Results do not depend on it.
 BLOCK = 512
 
-#: The number of pairs whose costs are computed at once is a multiple of this, which vectors divide: the rest of a loop
-#: takes as long for each pair as a vector. Results beyond the pairs are not used. Chosen.
+#: Costs are computed for a multiple of this number of pairs, so that loops have whole vectors: a pair in the rest of a
+#: loop takes as long as a vector. The surplus results are not used. Chosen.
 SIDE_BY_SIDE = 16
 
 #: Cost of a squared colour difference of 1 (channels are 0..1), in nats of shape. Between 3 and 10 it matters little
@@ -74,13 +74,13 @@ def log_det(xx, yy, zz, xy, xz, yz):
 
 @kernel()
 def pair_costs(lanes, first, step, count, largest, cost):
-    """Fill the costs of merging node first + i with that `step` places on: Runnalls' bound on the divergence.
+    """Fill the costs of merging node first + i with the node `step` places on: Runnalls' bound on the divergence.
 
     With coverages w as weights, and covariances P, it is ((w_i + w_j) ln|P_ij| - w_i ln|P_i| - w_j ln|P_j|) / 2
     (Runnalls 2007), plus COLOR_COST times Ward's variance of the colours. Branch-free, and columns are contiguous, so
     that LLVM vectorizes over pairs; with a slice of `lanes` instead of `first` it does not, and takes four times as
-    long. Indices are unsigned: of signed ones it cannot tell that none counts from the end, and it gathers the second
-    nodes one by one.
+    long. Indices are unsigned: signed ones might count from the end, so that LLVM would load the second nodes one by
+    one.
 
     Args:
         lanes: (LANES, at least first + count + step) columns of node rows, C-contiguous.
@@ -137,10 +137,10 @@ def find_partners(start, stop, rows, nodes, window, largest, partner, lowest):
 
 @kernel()
 def keep_cheaper(cost, count, best, at, here, there):
-    """Set best[i] to cost[i] and at[i], the partner of here + i, to there + i, where that cost is less.
+    """Update the best costs and partners of nodes here + i by the costs of the pairs (here + i, there + i).
 
-    Among equal costs, that partner wins whose index differs from the node's in the lowest bits. That relation is
-    symmetric, so among many equal splats half choose each other. `cost` is of pairs (here + i, there + i).
+    Among equal costs, the partner wins whose index differs from the node's in the lowest bits. This relation is
+    symmetric, so among many equal splats half choose each other.
     """
     for i in range(count):
         own, new = np.int32(here + i), np.int32(there + i)
@@ -177,10 +177,10 @@ def list_pairs(start, stop, nodes, partner, cost, limit, made, before, pairs, re
     """List the pairs of `count_pairs`, and the nodes after they have merged.
 
     Args:
-        made: the node that the first pair is merged into; the next pair's is one more.
+        made: number of the merged node of the first pair; the following pairs count up.
         before: (blocks, 2) sums of `counts` of the blocks before.
         pairs: (P, 2) filled.
-        rest: (n - P,) filled with the nodes in their order; a merged one replaces the first of its pair.
+        rest: (n - P,) filled with the nodes in their order; a merged node replaces the first of its pair.
     """
     n, blocks = len(nodes), len(before)
     for block in range(start, stop):
@@ -201,23 +201,23 @@ def list_pairs(start, stop, nodes, partner, cost, limit, made, before, pairs, re
 #: Least semi-axis of a merged node, in the builder's unit, so that it has an area. Chosen.
 SHORTEST = 1e-20
 
-#: Difference of eigenvalues, as a share of their mean, that float64's rounding gives those of a sphere. Chosen.
+#: Largest difference of a sphere's eigenvalues, as a share of their mean, by the rounding of float64. Chosen.
 SPHERICAL = 1e-12
 
 #: Added to the diagonal of P + Q, so that flat splats in one plane can be inverted: a share of its trace, which widens
 #: an axis to a thousandth of the longest; and variance in units squared, where both have no extent. Chosen.
 RIDGE, LEAST_RIDGE = 1e-6, 1e-30
 
-#: Least trace of a union's covariance, as a share of that of its two nodes without the overlap's part; with less, the
-#: product in space is not where they overlap (docs/decisions/11-quality-builder.md).
+#: Least trace of a union's covariance, as a share of the trace without subtracting the overlap; with less, the product
+#: in space is not at the overlap (docs/decisions/11-quality-builder.md).
 LEAST_UNION = 0.5
 
 #: Overlap that a node in a layer keeps, as a share of its pair's coverage. Without it, nodes of a coarse cut only just
 #: touch, and the background shows between them. Measured (benchmarks/notes/quality-builder.md).
 CLOSING = 0.12
 
-#: Overlaps, as shares of coverage: from LOOSE on a node keeps less, from DENSE on nothing, as splats that overlap as
-#: much leave no cracks. Two opaque equals in one place overlap by a quarter. Measured, too.
+#: Overlaps, as shares of coverage, between which the kept part falls to nothing: splats with much overlap leave no
+#: cracks. Two equal opaque splats at one place overlap by a quarter. Measured, too.
 LOOSE, DENSE = 0.15, 0.19
 
 #: Ratios of a node's shortest axis to its second: up to FLAT it is in a layer, from ROUND on it is in none. Chosen.
@@ -226,8 +226,8 @@ FLAT, ROUND = 0.1, 0.35
 #: Weight of opacity relative to each colour channel in the error of a picture, which may have any background. Chosen.
 ALPHA_WEIGHT = 1.0
 
-#: Two Gaussians do not overlap on a plane from this exponent on: e^-30 is 1e-13, and coverage is stored as a float32,
-#: whose precision is 6e-8. Chosen.
+#: Exponent from which on two Gaussians on a plane do not overlap: e^-30 is 1e-13, and the precision of coverage, a
+#: float32, is 6e-8. Chosen.
 MAX_EXPONENT = 30
 
 
@@ -257,9 +257,9 @@ def merge_pair(a, b, planes, merged):
     """Fill the centre, covariance and coverage of the union of two nodes; return their overlap as a share of coverage.
 
     The product of two Gaussians with covariances P and Q at 0 and d is a Gaussian with covariance P - P (P + Q)^-1 P at
-    P (P + Q)^-1 d. That of needles side by side, or of flat splats nearly in one plane, may be far away from both,
-    where their lines or planes cross; they overlap in projection only. The overlap is then not there, and subtracting
-    its moments would make the union's variance too small, or negative: they are left out.
+    P (P + Q)^-1 d. The product of needles side by side, or of flat splats nearly in one plane, may be far away from
+    both, where their lines or planes cross, while they overlap in projection only. Subtracting its moments would make
+    the union's variance too small, or negative: they are left out.
 
     Args:
         a, b: node rows.
@@ -349,9 +349,9 @@ def row_times(x, y, z, symmetric, divisor):
 def without(moment, of_product, hidden, first, second):
     """Return a second moment of two nodes, about their mean, less that of their overlap.
 
-    The mean moves by -hidden / (1 - hidden) of the middle. `of_product` is the covariance of the product of their
-    Gaussians, `hidden` the overlap's coverage as a share of the sum of the two, `first` and `second` are coordinates of
-    the product's centre, from the mean of the two.
+    Without the overlap, the mean moves by -hidden / (1 - hidden) times the offset of the product's centre. `of_product`
+    is the covariance of the product of the Gaussians, `hidden` the overlap's coverage as a share of the sum of both,
+    `first` and `second` are coordinates of the product's centre, from the mean of the two.
     """
     left = 1 - hidden
     return (moment - hidden * of_product) / left - hidden / (left * left) * first * second
@@ -363,11 +363,11 @@ def merge_pairs(start, stop, pairs, made, leaves, rows, row, spare, children, si
 
     Args:
         pairs: (P, 2) nodes.
-        made: the first node to fill; the next pair's is one more.
-        leaves: number of leaves, the nodes below it; `row` and the rest are of merged nodes.
+        made: number of the merged node of the first pair; the following pairs count up.
+        leaves: number of leaves, which have the first numbers; arrays of merged nodes leave them out.
         rows: (leaves, WIDTH) node rows; that of a leaf is its own.
-        row: (leaves,) filled with their rows.
-        spare: (leaves,) filled with a spare row in their trees.
+        row: (leaves,) filled with the rows of merged nodes.
+        spare: (leaves,) filled with an unused row in the tree of each merged node.
         children: (leaves, 2) filled.
         size: (2 * leaves,) of all nodes, filled with the feature size of the splat that will be drawn, units.
         error: (leaves,) filled with `picture_error`.
@@ -405,16 +405,16 @@ def merge_pairs(start, stop, pairs, made, leaves, rows, row, spare, children, si
 
 
 class OnPlane(NamedTuple):
-    """Integrals over a plane, divided by 2 pi, of Gaussians of height 1 that are projected onto it, in float64."""
+    """Integrals over a plane / (2 pi) of two projected Gaussians of height 1, and of their product, float64."""
 
-    both: Any  # of the product of the two
+    both: Any  # of the product
     first: Any
     second: Any
 
 
 @kernel(inline=True)
 def overlap_on_plane(axx, ayy, axy, bxx, byy, bxy, x, y):
-    """Return `OnPlane` of two Gaussians with covariances a and b, of which the second is at x, y from the first."""
+    """Return `OnPlane` of two Gaussians with covariances a and b, the second at x, y from the first."""
     a_det, b_det = max(axx * ayy - axy * axy, 0.0), max(bxx * byy - bxy * bxy, 0.0)
     xx, yy, xy = axx + bxx, ayy + byy, axy + bxy
     det = xx * yy - xy * xy
@@ -468,9 +468,9 @@ def overlap_share(planes, density_a, density_b):
 
 @kernel()
 def picture_error(a, b, merged, planes):
-    """Return squared difference between the picture of a merged node and that of its two nodes.
+    """Return the squared difference between the picture of a merged node and that of its two nodes.
 
-    It is summed over red, green, blue and opacity, and over the three planes; `planes` are `overlaps` of a and b.
+    The sum over red, green, blue and opacity, and over the three planes; `planes` are `overlaps` of a and b.
     """
     high_a, high_b, high = min(a[DENSITY], 1.0), min(b[DENSITY], 1.0), min(merged[DENSITY], 1.0)
     aa = bb = mm = ab = am = bm = 0.0

@@ -1,4 +1,4 @@
-"""The pixel scale of a node: its angular size, by which the traversal orders nodes."""
+"""The pixel scale of a node: the weighted angular size by which the traversal orders nodes."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ NODES, VIEWS = Type(NODE)[:], Type(VIEW)[:]
 #: Kinds of foveation.
 NO_FOVEATION, CONE, FRUSTUM = 0, 1, 2
 
-#: Least distance to a node, in object space; nearer nodes are treated as this far away, as in Spark 2.2.0's traversal.
+#: Least distance of a node, in object space, to which smaller ones are raised, as in Spark 2.2.0's traversal.
 NEAREST = np.float32(1e-6)
 ZERO, ONE, INFINITE = np.float32(0), np.float32(1), np.float32(np.inf)
 
@@ -71,9 +71,9 @@ def set_foveation(row: np.void, foveation: Foveation, fov_x: float, fov_y: float
 def foveation_at(view, dx, dy, dz, inverse):
     """Return the foveation weight of a node's pixel scale.
 
-    Cones: 1 inside the inner one, falling linearly in the cosine to `side` at the outer one, and on to `behind` at 90
-    degrees. Frustum: 1 inside, `side` outside, `behind` behind the camera. `dx`, `dy`, `dz` lead from the camera to the
-    node, object space; `inverse` is 1 / distance.
+    Cones: 1 inside the inner cone, falling linearly in the cosine to `side` at the outer cone, and on to `behind` at 90
+    degrees. Frustum: 1 inside, `side` outside, `behind` behind the camera. `dx`, `dy`, `dz` are the offset of the node
+    from the camera, object space; `inverse` is 1 / distance.
     """
     ahead = (dx * view.forward_x + dy * view.forward_y) + dz * view.forward_z
     if ahead <= ZERO:
@@ -107,7 +107,7 @@ def pixel_scale(node, view):
 
 @kernel(NODES, i8[:], VIEWS, i8, out(f4[:]), nogil=True)
 def pixel_scales(nodes, index, views, number, scales):
-    """Fill absolute pixel scales of nodes `index` of one tree, with NaN as infinity, as cuts order them."""
+    """Fill the absolute pixel scales of nodes `index` of one tree; NaN becomes infinity, as in the order of cuts."""
     view = views[number]
     for i in range(len(index)):
         scale = abs(pixel_scale(nodes[index[i]], view))

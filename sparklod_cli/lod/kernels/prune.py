@@ -1,11 +1,11 @@
 """Prunes a binary tree: drops the least useful nodes, so that cuts of the remaining tree are nearly as good.
 
-A node is drawn while the traversal's threshold is between its size and its parent's. While it is drawn it replaces k
-children by one splat, at the cost of some error; its usefulness is the span of ln(size) over which that happens x (k -
-1 - error cost) x a rarity weight. When a node is dropped, its children become its parent's.
+A node is drawn while the traversal's threshold is between its size and its parent's. It then replaces k children by
+one splat, at the cost of some error. Its usefulness is the span of these thresholds in ln(size) x (k - 1 - error cost)
+x a rarity weight. The children of a dropped node become children of its parent.
 
-Arrays are those of `pair_tree.fill_usefulness_terms` and `drop_nodes`: nodes from `leaves` on, of T, are merged.
-Blocks of a range are of about one size; there are as many as rows of `counts`, which is added to.
+Arrays are those of `quality.fill_usefulness_terms` and `drop_nodes`: nodes from `leaves` on, of T, are merged.
+Blocks of a range have about the same size, and `counts` a row for each, to which kernels add.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ...system.jit import f4, f8, i4, i8, kernel, out, u2, u4
 #: Size steps per octave, and octaves: all of float32's, 2^-128 to 2^128. Steps chosen.
 STEPS, OCTAVES = 4, 256
 
-#: Least size that has a logarithm here, just above float32's least normal number.
+#: Least size of which the logarithm is taken, just above float32's least normal number.
 LEAST_SIZE = np.float32(1e-37)
 
 #: Error cost, in splats, of a node whose error is the mean at its size; it grows with the square root of the error.
@@ -27,8 +27,7 @@ LEAST_SIZE = np.float32(1e-37)
 #: (benchmarks/notes/quality-builder.md).
 ERROR_COST = np.float32(0.4)
 
-#: In cuts of less than this share of the leaves the error cost falls in proportion, as such cuts have no node to spare.
-#: Chosen.
+#: In cuts of less than this share of the leaves, the error cost falls in proportion: small cuts need each node. Chosen.
 FEW = 0.2
 
 #: The rarity weight of a node that is drawn in cuts of n splats is n to the power of -0.5. Chosen.
@@ -37,18 +36,18 @@ RARITY = 0.5
 #: Nodes are dropped in this many rounds, which is nearly as good as one by one in order of usefulness. Chosen.
 ROUNDS = 8
 
-#: The most children of a node as long as any node can be dropped without exceeding it; then it doubles. A node that is
-#: smaller than its children has no use by the rule above, and biker's root got 2,575 children, which left nothing to
-#: draw with budgets between 1 and 2,575 (benchmarks/notes/quality-builder.md).
+#: Maximum number of children while nodes can be dropped within it; then it doubles. Without it, as a node smaller than
+#: its children has no usefulness, biker's root got 2,575 children: budgets between 1 and 2,575 drew the root alone
+#: (benchmarks/notes/quality-builder.md).
 MOST_CHILDREN = 16
 
-#: ln(size) of a root whose own size is not known yet: larger than any. Chosen.
+#: ln(size) of a root of unknown size: larger than any. Chosen.
 ABOVE_ALL = np.float32(1e6)
 
 #: Span of ln(size) of a node whose parent is that root. The mean is 0.26 before pruning and 0.43 after it, measured.
 UNKNOWN_SPAN = np.float32(0.3)
 
-#: Taken off such a root's count in `saved` of `pair_tree.drop_nodes`, so that it may have any number of children.
+#: Subtracted from such a root's count in `saved` of `quality.drop_nodes`, so that it may have any number of children.
 ROOM = 1 << 30
 
 #: The rank of a node that is dropped.
@@ -67,15 +66,15 @@ def size_step(size):
 
 @kernel(u4[:, :], i8, f4[:], out(u4[:]), out(f4[:]), out(u2[:]), out(i8[:]), out(f8[:]))
 def link(children, leaves, lost, parent, log_size, step_of, inner, sums):
-    """Fill the parents, the logarithms of sizes of merged nodes, and sums over these.
+    """Fill the parents, the logarithms of sizes of merged nodes, and sums over merged nodes.
 
-    One after the other, so that threads do not change the rounding of the sums.
+    On one thread, so that the rounding of the sums does not depend on threads.
 
     Args:
         log_size: sizes; replaced from `leaves` on.
         parent: (top + 1,) the root for all nodes; filled.
         step_of: (T - leaves,) filled with the size steps of merged nodes.
-        inner, sums: (STEPS * OCTAVES,) added to: the number of merged nodes of each step, and what their pictures lose.
+        inner, sums: (STEPS * OCTAVES,) increased by the number of merged nodes of each step, and their picture errors.
     """
     total = leaves + len(children)
     if len(parent) > total:
@@ -106,8 +105,8 @@ def fill_terms(start, stop, step_of, common, rare, mean, lost, weight):
     """Fill the rarity weights and error costs of merged nodes.
 
     Args:
-        common, rare, mean: (STEPS * OCTAVES,) rarity weight of each step, share of the error cost that counts in its
-            cuts, and mean error of the pictures of its nodes.
+        common, rare, mean: (STEPS * OCTAVES,) rarity weight of each step, factor of the error cost in its cuts, and
+            mean picture error of its nodes.
     """
     for slot in range(start, stop):
         step = step_of[slot]
@@ -129,7 +128,7 @@ def count_by_key(begin, end, kept, leaves, children, log_size, lost, weight, sav
 
     Args:
         kept: (n,) merged nodes but the root, less `leaves`, parents first.
-        children: the most of a node.
+        children: maximum number of children of a node.
         keys: (T - leaves - 1,) filled for `kept`; LAST_KEY if the node cannot be dropped.
         counts: (blocks, 1 << KEY_BITS).
     """
@@ -168,7 +167,7 @@ def drop_below(threshold, most, leaves, children, parent, log_size, weight, kept
             saved[node] = -1
             dropped += 1
             if above < len(keys):
-                keys[above] = 0  # its usefulness has changed, and is computed again when its turn comes
+                keys[above] = 0  # its usefulness has changed, and is computed again in its turn
         else:
             after -= 1
             kept[after] = node
@@ -177,7 +176,7 @@ def drop_below(threshold, most, leaves, children, parent, log_size, weight, kept
 
 @kernel(i8, i8, i4[:], out(u4[:]), ranges=True)
 def skip_dropped(start, stop, leaves, saved, parent):
-    """Update the parents of leaves and of merged nodes that are kept; arguments of `pair_tree.drop_nodes`."""
+    """Update the parents of leaves and of merged nodes that are kept; arguments of `quality.drop_nodes`."""
     for node in range(start, stop):
         if node < leaves or saved[node - leaves] != -1:
             find_parent(node, leaves, saved, parent)
@@ -195,7 +194,7 @@ def find_parent(node, leaves, saved, parent):
 
 @kernel(inline=True)
 def can_be_dropped(node, leaves, parent, saved, children):
-    """Return whether merged node `leaves + node` is kept as yet, and its parent has room for its children."""
+    """Return whether merged node `leaves + node` is still kept, and its parent has room for its children."""
     return saved[node] > 0 and saved[parent[node + leaves] - leaves] + saved[node] < children
 
 
@@ -213,7 +212,7 @@ def size_ranks(leaves, highest, parent, log_size, saved, latest):
     """Return (T - leaves,) int32 ranks of merged nodes in the final order, NO_RANK for dropped nodes.
 
     A rank is the number of size steps below `highest`, the ln(size) of rank 0; it is above the parent's. `latest` is
-    empty or has for each leaf the rank that its parent must be below.
+    empty, or has an upper bound, exclusive, of the rank of each leaf's parent.
     """
     total = len(parent)
     rank = np.full(total - leaves, NO_RANK, np.int32)

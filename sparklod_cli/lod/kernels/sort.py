@@ -1,4 +1,4 @@
-"""Morton codes of cells, a parallel, stable radix sort by them, and nodes in a box."""
+"""Morton codes of cells, a parallel, stable radix sort, and separation of the nodes in a box."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def cell_words(geometry: FloatArray, nodes: Nodes, grid: Parts, word: int) -> Ke
 
 @kernel(i8, u8[:], i8, out(i8[:, :]), ranges=True)
 def count_keys(begin, end, keys, shift, counts):
-    """Count the keys of blocks of about one size by the bits from `shift` on, into (blocks, 1 << bits) `counts`."""
+    """Count the keys of each block by `bits` bits from `shift` on, into (blocks, 1 << bits) `counts`."""
     low, mask = np.uint64(shift), np.uint64(counts.shape[1] - 1)
     for block in range(begin, end):
         for i in range(len(keys) * block // len(counts), len(keys) * (block + 1) // len(counts)):
@@ -96,9 +96,9 @@ def count_keys(begin, end, keys, shift, counts):
 
 @kernel(i8, u8[:], u4[:], i8, out(i8[:, :]), out(u8[:]), out(u4[:]), ranges=True)
 def place_keys(begin, end, keys, values, shift, places, keys_out, values_out):
-    """Put keys in the order of the bits of `count_keys`, and values with them, into `keys_out` and `values_out`.
+    """Write keys and their values in the order of the bits of `count_keys`.
 
-    `places` has where the first key of each block with each value of the bits goes; it is changed.
+    `places` has the place of the next key for each block and each value of the bits; it is updated.
     """
     low, mask = np.uint64(shift), np.uint64(places.shape[1] - 1)
     for block in range(begin, end):
@@ -113,7 +113,7 @@ def place_keys(begin, end, keys, values, shift, places, keys_out, values_out):
 def sort_by_key(keys: Keys, values: Nodes, key_bits: int, blocks: int) -> tuple[Keys, Nodes]:
     """Return (n,) uint64 keys below 2 ** key_bits and (n,) values, sorted stably by key; overwrites its inputs.
 
-    `blocks` are ranges to process in parallel; the result does not depend on it.
+    `blocks` is the number of parallel ranges; the result does not depend on it.
     """
     passes = max(1, -(-key_bits // DIGIT_BITS))
     bits = max(1, -(-key_bits // passes))
@@ -135,11 +135,11 @@ def sort_by_cell(
 
     Args:
         geometry, nodes: as for `fill_cell_words`.
-        blocks: ranges to process in parallel; the result does not depend on it.
-        within: whether to sort within cells, too; otherwise a cell's nodes stay in their order.
+        blocks: number of parallel ranges; the result does not depend on it.
+        within: sort within cells, too; otherwise a cell's nodes stay in their order.
 
     Returns:
-        the (n,) sorted nodes, and (n,) whether each is the first of its cell.
+        (n,) sorted nodes, and (n,) whether each is the first of its cell.
     """
     axis_bits, words, in_cell = grid.axis_bits, grid.words, np.uint64(3 * PART_BITS)
     is_first = np.zeros(len(nodes), np.bool_)
@@ -160,21 +160,21 @@ def sort_by_cell(
 
 @kernel(i8, f4[:, :], f4[:, :], f8[:], f8, i8[:], i8, out(u8[:]), out(i4[:]), ranges=True)
 def fill_level_keys(begin, end, center, scale, steps, grid, low, cell_bits, keys, levels):
-    """Fill sort keys that order splats by level, an index into `steps`, and along a Morton curve; and their levels.
+    """Fill the levels of splats, indices into `steps`, and keys that order splats by level and along a Morton curve.
 
     Args:
         steps: (L,) the cell edge of each level, a rising geometric series. The last is at least the largest size;
             splats smaller than the first belong to it.
         grid: edge of the cells of the curve.
         low: (3,) the lowest cell of the curve.
-        cell_bits: number of bits for the curve; the level's bits are above them.
+        cell_bits: number of bits of the curve, the lower bits of a key.
     """
     start = math.log(steps[0])
     per_level = (len(steps) - 1) / (math.log(steps[-1]) - start)
     for i in range(begin, end):
         size = 2 * np.float64(max(scale[i, 0], scale[i, 1], scale[i, 2]))
         level = min(max(np.int64(math.ceil((math.log(size) - start) * per_level)), 0), len(steps) - 1)
-        # The logarithm is rounded; the table of steps defines the level.
+        # The logarithm is rounded, so the table of steps decides.
         while level > 0 and size <= steps[level - 1]:
             level -= 1
         while size > steps[level]:
@@ -186,7 +186,7 @@ def fill_level_keys(begin, end, center, scale, steps, grid, low, cell_bits, keys
 
 @kernel(u4[:], f4[:, :], f4[:], f4[:])
 def split_box(nodes, geometry, below, above):
-    """Return the nodes with centres between two corners, (3,) `below` and `above`, and the others, in their order."""
+    """Return the nodes with centres between corners, (3,) `below` and `above`, and the other nodes, in their order."""
     inside, outside = np.empty(len(nodes), np.uint32), np.empty(len(nodes), np.uint32)
     n = m = 0
     for i in range(len(nodes)):

@@ -11,14 +11,14 @@ import numpy as np
 from ...system.jit import b1, f4, f8, i4, i8, kernel, out, u2, u4
 from .geometry import ellipsoid_area
 
-#: Links followed per node at most. A tree has fewer than one; in a broken tree nodes may share children, so that links
-#: can number up to the square of the nodes. Chosen.
+#: Maximum number of followed links per node. A tree has fewer than one; in a broken tree nodes may share children, so
+#: that the number of links can be the square of that of nodes. Chosen.
 MAX_LINKS = 4
 
-#: Upper bits of limits, as float32, by which nodes are counted.
+#: Number of the upper bits of limits, as float32, by which nodes are counted.
 LIMIT_BITS = 16
 
-#: Least surface area of a child, so that children whose areas are not float64 numbers above 0 count equally. Chosen.
+#: Least surface area of a child, so that children whose areas are 0 in float64 count equally. Chosen.
 LEAST_AREA = 1e-300
 
 
@@ -29,8 +29,8 @@ def find_depths(child_count, child_start, size):
     Takes linear time for any links: at most MAX_LINKS per node are followed.
 
     Returns:
-        depth: int32, edges from the root on the first path found; -1 for nodes that no path reaches.
-        limit: float32, the least size on that path, the node's included; 0 for nodes that no path reaches.
+        depth: int32, edges from the root on the first path found; -1 for unreachable nodes.
+        limit: float32, least size on this path, the node's included; 0 for unreachable nodes.
     """
     count = len(child_count)
     depth = np.full(count, -1, np.int32)
@@ -78,9 +78,8 @@ def find_parents(child_count, child_start):
     """Return parents of all nodes.
 
     Returns:
-        parent: int32, the last node that has it as a child; -1 if none has, or none of the MAX_LINKS per node that are
-            followed.
-        references: int32, the number of nodes that have it as a child.
+        parent: int32, the last node with this node as a child, among the followed links, MAX_LINKS per node; else -1.
+        references: int32, number of nodes with this node as a child.
     """
     count = len(child_count)
     parent = np.full(count, -1, np.int32)
@@ -104,9 +103,9 @@ def find_parents(child_count, child_start):
 
 @kernel(i4[:], f4[:], f4[:, :], f4[:], out(f8[:]), nogil=True)
 def fill_weights(parent, size, scale, opacity, weight):
-    """Fill the weights of nodes in the mean size of their parents' children: opacity (linear) times surface area.
+    """Fill the weights of nodes in the mean size of their parents' children: linear opacity times surface area.
 
-    It is -1 for nodes without a parent, a positive opacity or a positive, finite size.
+    The weight of a node without a parent, a positive opacity or a positive, finite size is -1.
     """
     for node in range(len(parent)):
         weight[node] = -1
@@ -119,7 +118,7 @@ def fill_weights(parent, size, scale, opacity, weight):
 def add_weighted(parent, size, weight, sums, weights):
     """Add a block of nodes to the sums of their parents' children, whose mean size is `sums` over `weights`.
 
-    Sums grow in the order of nodes, so that they are the same for blocks of nodes as for all nodes at once.
+    Sums are in the order of nodes, so that they do not depend on the blocks.
     """
     for node in range(len(parent)):
         if not weight[node] < 0:
@@ -129,7 +128,7 @@ def add_weighted(parent, size, weight, sums, weights):
 
 @kernel(i4[:], i4[:], nogil=True)
 def find_cycles(parent, depth):
-    """Return whether each node is on a cycle, or below one: its ancestors are neither the root nor without a parent."""
+    """Return whether each node is on a cycle or below one, so that no ancestor is the root or lacks a parent."""
     unknown, ends, cycle, passed = 0, 1, 2, 3
     state = np.zeros(len(parent), np.uint8)
     for node in range(len(parent)):
@@ -149,12 +148,12 @@ def find_cycles(parent, depth):
 
 @kernel(i4[:], u2[:], f4[:], nogil=True)
 def sum_by_depth(depth, child_count, size):
-    """Return numbers of nodes and sums of their sizes by depth; nodes of depth -1 are left out of both.
+    """Return statistics of the nodes by depth, without unreachable nodes, of depth -1.
 
     Returns:
         nodes, leaves: (depths,) int64 numbers.
-        logs: (depths,) float64, sums of ln(size).
-        children: (65536,) int64, the number of nodes, of any depth, by number of children.
+        logs: (depths,) float64 sums of ln(size).
+        children: (65536,) int64 numbers of nodes, unreachable ones too, by number of children.
     """
     depths = depth.max() + 1
     nodes = np.zeros(depths, np.int64)
@@ -175,7 +174,7 @@ def count_limits(child_count, child_start, limit, chunk_bits, counts):
     """Add inner nodes with limits above 0 to (1 << LIMIT_BITS,) counts, by the upper bits of their limits.
 
     Returns:
-        number of inner nodes, whatever their limit, whose children lie in more than one chunk of 2 ** chunk_bits nodes.
+        number of inner nodes, of any limit, with children in more than one chunk of 2 ** chunk_bits nodes.
     """
     bits = limit.view(np.uint32)
     split = 0
@@ -190,14 +189,14 @@ def count_limits(child_count, child_start, limit, chunk_bits, counts):
 
 @kernel(u2[:], u4[:], f4[:], f8, out(b1[:]), nogil=True)
 def mark_small(child_count, child_start, size, ratio, marks):
-    """Mark nodes whose size is less than `ratio` times that of a child of finite size; return how many there are."""
+    """Mark nodes smaller than `ratio` times a child of finite size; return the number of marked nodes."""
     count, marked, steps = len(child_count), 0, 0
     for node in range(count):
         start = np.int64(child_start[node])
         end = min(count, start + np.int64(child_count[node]))
         steps += max(0, end - start)
         if steps > MAX_LINKS * count:
-            marks[node] = start < end  # links of a broken tree may be too many to be followed
+            marks[node] = start < end  # a broken tree may have too many links to follow
         most = np.float32(0)
         for child in range(start, start if marks[node] else end):
             if most < size[child] < np.inf:
@@ -212,8 +211,8 @@ def mark_small(child_count, child_start, size, ratio, marks):
 def find_limits(parent, size):
     """Return int32 depths, edges from the root, and float32 limits of the nodes that have children.
 
-    `parent` is the place here of each node's parent, which comes before it, -1 for the root; a limit is the least size
-    from the root to the node, its own included.
+    `parent` is the place of each node's parent among these nodes, which comes before it, -1 for the root; a limit is
+    the least size from the root to the node, its own included.
     """
     depth, limit = np.zeros(len(parent), np.int32), np.empty(len(parent), np.float32)
     for family in range(len(parent)):
