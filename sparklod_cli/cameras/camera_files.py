@@ -145,11 +145,11 @@ class CameraJson(untrusted.Json):
         return value if isinstance(value, str) else "" if value is None else quoted_value(value)
 
     def matrix_4x4(self, *rows: int) -> Matrix:
-        """Return the (4, 4) matrix of four rows, or of three rows above 0 0 0 1 if `rows` allow it."""
+        """Return a (4, 4) matrix of 4 rows, or of any number in `rows`; 3 rows lack the last one, 0 0 0 1."""
         return np.array([*self.matrix(*(rows or (4,))), 0, 0, 0, 1][:16]).reshape(4, 4)
 
     def pose(self, quat_wxyz: Sequence[float], position: Sequence[float]) -> Matrix:
-        """Return the (4, 4) pose of a quaternion of this object and a position; it is an error if one has length 0."""
+        """Return the (4, 4) pose of a quaternion and a position, or raise an error for a quaternion of length 0."""
         try:
             return pose(rotation_of(quat_wxyz), position)
         except ValueError as error:

@@ -206,7 +206,7 @@ PERCENTILE = re.compile(r"p(100|[1-9]?[0-9])")
 
 
 def is_statistic(name: str) -> bool:
-    """Whether a name is one of `STATISTICS` or a percentile such as p95."""
+    """Return whether a name is one of `STATISTICS` or a percentile such as p95."""
     return name in STATISTICS or PERCENTILE.fullmatch(name) is not None
 
 

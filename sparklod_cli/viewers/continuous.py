@@ -154,7 +154,7 @@ def _first_over(limit: NDArray[np.float32], more: NDArray[np.int64], room: int) 
 
 
 class _Inner:
-    """The M inner nodes of a tree, by depth; `more` (M,) is the number of their children minus 1."""
+    """The M inner nodes of a tree in order of depth; `more`, (M,), is the number of their children minus 1."""
 
     def __init__(self, nodes: NDArray[np.void]) -> None:
         children, start = nodes["child_count"].astype(np.uint16), nodes["child_start"].copy()

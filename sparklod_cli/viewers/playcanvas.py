@@ -55,7 +55,7 @@ ENVIRONMENT, NOTHING_DRAWN, ANOTHER_LEVEL, NEXT = 4, 2, 1, 0
 
 @dataclass(frozen=True, eq=False)
 class Chains:
-    """The levels of regions from the finest to the coarsest that may be shown, with what each shows.
+    """The levels that regions show at each place, from the finest to the coarsest level that the rule allows.
 
     A region that has no splats at a level shows the next finer level that has some, and without one the next coarser.
     Beyond the coarsest level that has splats it shows nothing.
@@ -131,7 +131,10 @@ def choose(instances: Sequence[Distant], budget: int, rule: DetailRule) -> Detai
 
 
 def _keys(instance: Distant, rule: DetailRule) -> Levels:
-    """Return the (R, S - 1) positions of the steps of each region, descending, in whole numbers of parts of bins."""
+    """Return (R, S - 1) int64, when regions step to the next coarser levels, descending: logarithms in parts of bins.
+
+    A step is due at its distance where the key is `DUE * PARTS`.
+    """
     chains, step = instance.chains, math.log(rule.multiplier) * PER_LOG
     zero = (-math.log(instance.base_distance) - LOWEST) * PER_LOG - (chains.finest - 1) * step
     distance = np.log(np.maximum(instance.squared_distance, NEAREST_SQUARED)) * (PER_LOG * 0.5) + zero
