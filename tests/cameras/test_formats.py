@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import struct
 import subprocess
 import warnings
@@ -38,7 +37,7 @@ from tests.cameras.known import (
     read_json,
     text_file,
 )
-from tests.interop.node import folder_with
+from tests.interop.node import ENGINES, folder_with
 
 #: What has to be said about a format that leaves things open.
 NO_LENS = Settings(size=SIZE, fov_y=FOV_Y)
@@ -581,10 +580,6 @@ def test_a_byte_order_mark_changes_nothing(name: str, encoding: str) -> None:
 # The programs themselves
 
 
-#: The version that has --camera-track; playcanvas is its peer.
-SPLAT_TRANSFORM = {"@playcanvas/splat-transform": "3.7.0", "playcanvas": "2.23.3"}
-
-
 def random_poses(count: int) -> list[NDArray[np.float64]]:
     """(4, 4) each: from the world to a camera in OpenCV's axes, which has the landmark before it."""
     random = np.random.default_rng(7)
@@ -601,11 +596,7 @@ def random_poses(count: int) -> list[NDArray[np.float64]]:
 
 @pytest.fixture(scope="module")
 def packages(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if shutil.which("node") is None:
-        pytest.skip("Node is not installed")
-    return folder_with(
-        SPLAT_TRANSFORM, variable="SPLAT_TRANSFORM_DIR", request=request, tmp_path_factory=tmp_path_factory
-    )
+    return folder_with(ENGINES, variable="ENGINES_DIR", request=request, tmp_path_factory=tmp_path_factory)
 
 
 def viewer(**changes: Any) -> dict[str, Any]:

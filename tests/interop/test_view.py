@@ -153,15 +153,16 @@ def shown(tab: Tab, page_dir: Path, trees: Path) -> Iterator[Tab]:
         yield tab
 
 
-def rendered(
-    file: Path, camera: list[str], out: Path, budget: int | None = BUDGET
-) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """The picture of `sparklod render`."""
-    more = [*camera, *(() if budget is None else ("--budget", str(budget)))]
-    size = f"{SIZE[0]}x{SIZE[1]}"
-    command = ["render", str(file), *more, "--size", size, "--background", "black", "-q"]
-    assert run([*command, "-o", str(out), "--overwrite"]) == 0
-    return pixels(out)
+def check_picture(
+    tab: Tab, state: dict[str, Any], file: Path, folder: Path, budget: int | None = BUDGET, least: float = LEAST
+) -> None:
+    """Assert that the page shows the picture of `sparklod render` from the camera that it copies out."""
+    out, theirs = folder / "r.png", tab.picture(folder / "page.png")
+    limit = [] if budget is None else ["--budget", str(budget)]
+    more = ["--size", f"{SIZE[0]}x{SIZE[1]}", "--background", "black", "-q", "-o", str(out), "--overwrite"]
+    assert run(["render", str(file), *state["camera"].split(), *limit, *more]) == 0
+    assert theirs.max(axis=2).mean() > 0.05, "the picture is empty"
+    assert psnr(theirs - pixels(out)) >= least
 
 
 def test_on_a_phone_the_panel_leaves_the_middle_of_the_scene_free(tab: Tab, page_dir: Path, trees: Path) -> None:
@@ -217,9 +218,7 @@ def test_streamed_sog_is_shown_in_playcanvas(tab: Tab, others: Path, trees: Path
         assert state["faults"] == []
         assert state["camera"] == "--look-at=0,-3.4,9:0,-1.1,0 --fov=40"
         assert (state["drawn"], state["budget"]) == (SPLATS, f"{SPLATS:,} (all)")
-        theirs = tab.picture(tmp_path / "page.png")
-        ours = rendered(manifest, state["camera"].split(), tmp_path / "r.png", SPLATS)
-        assert psnr(theirs - ours) >= LEAST_OF_PLAYCANVAS
+        check_picture(tab, state, manifest, tmp_path, SPLATS, LEAST_OF_PLAYCANVAS)
         tab.ask("press", key="l")
         assert tab.until(lambda state: state["legend"] is not None)["legend"] == "01"
         tab.ask("fill", id="budget", value="0")
@@ -235,9 +234,7 @@ def test_a_glb_is_shown_in_playcanvas(up: str | None, tab: Tab, others: Path, tr
         tab.open(url)
         state = tab.settled()
         assert (state["faults"], state["message"], state["drawn"]) == ([], None, SPLATS)
-        theirs = tab.picture(tmp_path / "page.png")
-        ours = rendered(file, state["camera"].split(), tmp_path / "r.png", None)
-        assert psnr(theirs - ours) >= LEAST_OF_PLAYCANVAS
+        check_picture(tab, state, file, tmp_path, None, LEAST_OF_PLAYCANVAS)
 
 
 def test_3d_tiles_are_shown_in_cesium(tab: Tab, others: Path, trees: Path, tmp_path: Path) -> None:
@@ -282,10 +279,7 @@ def test_the_page_shows_what_render_draws(shown: Tab, trees: Path, tmp_path: Pat
     assert 0.9 * BUDGET < state["drawn"] <= BUDGET
     assert state["said"] == f"{state['drawn']:,}"
     assert state["budget"] == f"{BUDGET:,}"
-    theirs = shown.picture(tmp_path / "page.png")
-    ours = rendered(trees / "demo.spz", state["camera"].split(), tmp_path / "r.png")
-    assert theirs.max(axis=2).mean() > 0.1, "the picture is empty"
-    assert psnr(theirs - ours) >= LEAST
+    check_picture(shown, state, trees / "demo.spz", tmp_path)
 
 
 def test_the_slider_changes_the_budget(shown: Tab) -> None:
@@ -361,10 +355,7 @@ def test_a_rad_tree_with_sh_of_degree_3_is_paged_whole(tab: Tab, page_dir: Path,
         tab.until(lambda state: state["chunks"] == "2 of 2")
         state = tab.settled()
         assert (state["faults"], state["errors"], state["message"]) == ([], [], None)
-        theirs = tab.picture(tmp_path / "page.png")
-        ours = rendered(tmp_path / "sh3.rad", state["camera"].split(), tmp_path / "r.png", 4_000)
-        assert theirs.max(axis=2).mean() > 0.05, "the picture is empty"
-        assert psnr(theirs - ours) >= LEAST
+        check_picture(tab, state, tmp_path / "sh3.rad", tmp_path, 4_000)
 
 
 @pytest.mark.parametrize("how", ["rejection", "console", "event"])
@@ -393,9 +384,7 @@ def test_an_exported_site_works_without_sparklod_and_without_ranges(
         state = tab.settled()
         assert state["faults"] == []
         assert state["files"][0].endswith("loaded whole: this host sends no ranges")
-        theirs = tab.picture(tmp_path / "page.png")
-        ours = rendered(trees / "demo.rad", state["camera"].split(), tmp_path / "r.png")
-        assert psnr(theirs - ours) >= LEAST
+        check_picture(tab, state, trees / "demo.rad", tmp_path)
         tab.ask("drop", name="path.json", text=json.dumps(PATH))
         tab.until(lambda state: state["path"] is not None)
         tab.ask("fill", id="scrub", value="500")
