@@ -76,7 +76,7 @@ class Files:
 
 @dataclass(frozen=True)
 class Parsed:
-    """The result of a parser.
+    """Frames of a file, from a parser.
 
     Attributes:
         frames: in order; or a function that computes frames between keys from their numbers.

@@ -28,7 +28,7 @@ from .results import COLUMNS, LOADING, OF_BUDGETS, OF_TREES, Extremes, FrameOutp
 
 
 class SimulatedFrame(NamedTuple):
-    """One frame.
+    """A frame of a simulation: its camera, cut, and rows of the table.
 
     Attributes:
         number: of the frame on the path.

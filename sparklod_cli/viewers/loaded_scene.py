@@ -41,7 +41,7 @@ class Viewer(Protocol):
     def cut(
         self, camera: Camera, *, budget: int, smallest: float = 0.0, resident: NDArray[np.bool_] | None = None
     ) -> TreeCut:
-        """Return the cut that it draws; `TreeCut.wanted` lists the chunks that it requests.
+        """Return the cut that the viewer draws; `TreeCut.wanted` lists the chunks that it requests.
 
         Args:
             budget: maximum number of splats, all instances together; at least one per instance.
@@ -270,7 +270,7 @@ class LoadedScene:
 
     @property
     def headers(self) -> tuple[int, ...]:
-        """Bytes of the answers that a viewer waits for before it can ask for a chunk."""
+        """Bytes of the answers with the header, which a viewer needs before it can request a chunk."""
         return header_answers(self.scene.header.get("header_bytes", 0), self.bytes) if self.has_chunks else ()
 
 
