@@ -224,27 +224,6 @@ def test_a_chunk_is_requested_after_the_header_and_arrives_at_its_time() -> None
     assert (stream.take_bytes(), stream.take_arrivals()) == (MB, [0])
 
 
-def arrivals_at_rest(stream: ChunkStream) -> list[tuple[float, int]]:
-    stream.want([])
-    arrivals: list[tuple[float, int]] = []
-    while stream.cache.missing():
-        stream.step()
-        arrivals += [(stream.now, chunk) for chunk in stream.take_arrivals()]
-    return arrivals
-
-
-def test_transfers_share_the_link() -> None:
-    # Headers of two trees at once, each with half of the bandwidth; the second one takes two answers.
-    headers = sized([[MB], [MB]], [[MB], [MB, 2 * MB]])
-    assert arrivals_at_rest(ChunkStream(headers, Network(2 * MB, 0.5, 1))) == [
-        (pytest.approx(0.5 + 1 + 0.5 + 1), 0),  # while half of the longer answer arrives
-        (pytest.approx(3.0 + 0.5 + 0.5 + 0.5), 1),
-    ]
-    # 1 and 3 MB together at 1 MB/s: the small one has half of it and ends after 2 s, the large one after 4 s.
-    stream = ChunkStream(sized([[1 * MB], [3 * MB]]), Network(1 * MB, 1.0))
-    assert arrivals_at_rest(stream) == [(pytest.approx(3.0), 0), (pytest.approx(5.0), 1)]
-
-
 @given(st.data(), tree_sizes)
 def test_the_default_network_brings_at_once_what_fits(data: st.DataObject, sizes: list[list[int]]) -> None:
     sizes = [[0 if size % 3 else size for size in tree] for tree in sizes]  # some of no bytes
@@ -301,30 +280,6 @@ def test_the_least_recently_used_chunk_is_evicted(data: st.DataObject) -> None:
         assert int(cache.resident().sum()) <= naive.capacity
         assert cache.missing() == [chunk for chunk in cache.admitted if chunk not in naive.used]
         assert not rooted or set(chunks.roots) <= set(cache.admitted)
-
-
-def test_unwanted_late_arrivals_are_evicted_first() -> None:
-    cache = ChunkCache(sized([[1, 1, 1], [1]]), 3)
-    cache.want([])
-    for chunk in (0, 3, 1):  # the last is not wanted, and there is room
-        assert cache.arrive(chunk) is None
-    cache.want([2])
-    assert cache.arrive(2) == 1
-    cache = ChunkCache(sized([[1, 1, 1], [1]]), 3)
-    cache.want([2])
-    assert [cache.arrive(chunk) for chunk in (0, 3, 1, 2)] == [None, None, None, 1]
-
-
-def test_a_copy_of_a_cache_is_independent() -> None:
-    cache = ChunkCache(sized([[1, 1, 1]]), 2)
-    cache.want([1])
-    cache.arrive(0)
-    twin = cache.copy()
-    twin.arrive(1)
-    twin.want([2])
-    assert twin.arrive(2) == 1
-    assert resident(cache) == {0}
-    assert cache.requested == [0, 1]
 
 
 @pytest.mark.parametrize(
