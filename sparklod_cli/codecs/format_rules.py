@@ -1,4 +1,4 @@
-"""Rules of formats and how they are broken, bounds of splats, and manifests in JSON whose nodes have "children"."""
+"""Violations of rules of formats, bounds of splats, and JSON manifests of trees whose nodes have "children"."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class RuleViolation:
     """Rule of a format that a file breaks.
 
     Attributes:
-        code: for `inspect`, such as "rad.sizes".
-        text: what is wrong, with the values.
-        fatal: a viewer, or this reader, cannot read the file, or would read something else than was written.
+        code: code of the finding of `inspect`, such as "rad.sizes".
+        text: description of the fault with its values.
+        fatal: a viewer, or this reader, cannot read the file, or would misread it.
     """
 
     code: str
@@ -49,15 +49,15 @@ def check_rules(violations: Iterable[RuleViolation]) -> None:
 
 
 def error_of(code: str, text: str) -> FormatError:
-    """Return the error for a broken rule, which has its code."""
+    """Return a `FormatError` with the code of the broken rule."""
     error = FormatError(text)
     error.code = code
     return error
 
 
-#: By how much a splat may lie outside of its bound: a share of its own extent, by which codes of 8 bits change it; of
-#: its largest scale, since they turn it by up to 1.1 degrees; of the bound; and, for codes of logarithms of 16 bits, of
-#: the distance from the origin plus 1, or half a step of these codes where that is more.
+#: Allowed distance of a splat outside of its bound: a share of its own extent, the error of codes of 8 bits; of its
+#: largest scale, since such codes turn it by up to 1.1 degrees; of the bound; and of the distance from the origin plus
+#: 1, the error of 16-bit codes of logarithms, unless half a step of these codes is more.
 LOOSE_EXTENT, LOOSE_TURN, LOOSE_BOUND, LOOSE_CENTER = 0.25, 0.02, 1e-3, 2e-4
 
 
@@ -67,12 +67,12 @@ def count_outside(
     steps: NDArray[np.float64] | float = 0.0,
     directions: NDArray[np.float64] | None = None,
 ) -> int:
-    """Count the splats that lie outside of a bound with the ellipsoids of one standard deviation.
+    """Count the splats whose ellipsoids of one standard deviation reach out of a bound.
 
     Args:
         bound: (2, 3) lowest and highest coordinates along the directions.
-        steps: (3,) those of the codes of centres, as shares of the distance from the origin plus 1.
-        directions: (3, 3) unit vectors as rows, those of the sides of a box; None for the axes.
+        steps: (3,) steps of the codes of centres, as shares of the distance from the origin plus 1.
+        directions: (3, 3) unit vectors along the sides of the bound as rows; None for the axes.
     """
     loose, step = LOOSE_BOUND * np.abs(bound[1] - bound[0]), np.maximum(LOOSE_CENTER, np.expm1(steps) / 2)
     count = 0
@@ -91,12 +91,12 @@ def count_outside(
     return count
 
 
-#: Deepest nesting of a manifest; a node of a tree takes two.
+#: Deepest nesting of a manifest; a node of a tree adds two levels.
 MAX_NESTING = 512
 
 
 def parse_manifest(data: bytes, called: str, most: int) -> Json:
-    """Parse a manifest of at most `most` bytes, called so in messages; raises `FormatError` if it is no object."""
+    """Parse a manifest of at most `most` bytes; a `FormatError` calls it `called`."""
     root = Json.parse(data, Origin(called, FormatError), most=most, depth=MAX_NESTING)
     if not isinstance(root.value, dict):
         raise root.unexpected("an object")
@@ -106,11 +106,11 @@ def parse_manifest(data: bytes, called: str, most: int) -> Json:
 def place_of(
     root: str, number: int, parent_of: Callable[[int], int], children_of: Callable[[int], Sequence[int]]
 ) -> str:
-    """Return the place of a node in a file, such as "tree.children[0]", where "tree" is `root`.
+    """Return the place of a node in a file, such as "tree.children[0]" for the root "tree".
 
     Args:
-        parent_of: number of the parent of a node, -1 of the root.
-        children_of: numbers of the children, ascending.
+        parent_of: returns the number of the parent of a node, -1 for the root.
+        children_of: returns the ascending numbers of the children of a node.
     """
     way = list[str]()
     while (parent := parent_of(number)) >= 0:
@@ -120,10 +120,7 @@ def place_of(
 
 
 def nodes_of(tree: Json, most: int) -> list[tuple[Json, int, list[int]]]:
-    """Return the nodes of a tree, however deep, root first and depth first.
-
-    A node is its object, the number of its parent, -1 of the root, and the numbers of its children.
-    """
+    """Return the nodes of a tree depth first: object, number of the parent, -1 for the root, and of the children."""
     nodes = list[tuple[Json, int, list[int]]]()
     waiting = [(tree, -1)]
     while waiting:
@@ -144,5 +141,5 @@ def nodes_of(tree: Json, most: int) -> list[tuple[Json, int, list[int]]]:
 
 
 def leads_away(name: str) -> bool:
-    """Return True if a name means something else than a file in the manifest's folder or in one below."""
+    """Return whether a name leads out of the manifest's folder, or is no plain relative path."""
     return any(part in ("", ".", "..") for part in name.split("/")) or any(mark in name for mark in "\\:\0?#")

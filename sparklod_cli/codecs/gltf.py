@@ -84,11 +84,9 @@ Coding = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Attribute:
-    """Attribute of a splat.
+    """Attribute of a splat, named `semantic` in the file; `type` is that of its accessor.
 
     Attributes:
-        semantic: its name in the file.
-        type: type of its accessor.
         integers: component types besides float that are read.
         column: column of `Splats`.
         decode, encode: conversions between values of the file and of the column.

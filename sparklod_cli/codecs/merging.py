@@ -53,19 +53,24 @@ def placed(reader: Reader, transform: Transform) -> Reader:
 
 
 def merged(parts: Sequence[Placed]) -> Reader:
-    """Merge one scene or more: their splats in this order, of the highest SH degree; lower ones are padded with zeros.
+    """Merge one scene or more in this order; SH of lower degrees are padded with zeros.
 
-    The result is antialiased if most of the splats are, and a note says where they differ. It has an up axis if all
-    scenes have the same. Errors name the scene.
+    The result is antialiased if most splats are, with a note if they differ, and has the up axis that all scenes share.
+    Errors name the scene.
     """
-    degree = max(part.reader.sh_degree for part in parts)
-    antialiased, notes = _antialiased(parts)
-    notes += tuple(f"{part.name}: {note}" for part in parts for note in part.reader.notes)
+    degree, count = max(part.reader.sh_degree for part in parts), sum(part.reader.count for part in parts)
+    found = sum(part.reader.count for part in parts if part.reader.antialiased)
+    antialiased, notes = 2 * found > count, list[str]()
+    if found not in (0, count):
+        kind = "antialiased" if antialiased else "not antialiased"
+        text = f"{found:,} of {count_of(count, 'splat')} are antialiased, and the others are not"
+        notes.append(f"{text}; all are written as {kind}")
+    notes += [f"{part.name}: {note}" for part in parts for note in part.reader.notes]
     axes = [part.reader.up and rotated_axis(part.reader.up, part.transform.rotation) for part in parts]
     if len(set(axes)) > 1:
-        notes += (f"{differing(axes)}, so none is noted unless --up names it",)
+        notes.append(f"{differing(axes)}, so none is noted unless --up names it")
     return Reader(
-        sum(part.reader.count for part in parts),
+        count,
         degree,
         " and ".join(sorted({part.reader.format for part in parts})),
         FillMerged(tuple(parts)),
@@ -76,18 +81,6 @@ def merged(parts: Sequence[Placed]) -> Reader:
         if axes == [part.reader.up for part in parts]
         else "",
     )
-
-
-def _antialiased(parts: Sequence[Placed]) -> tuple[bool, tuple[str, ...]]:
-    """Return whether most splats are antialiased, and a note if they differ."""
-    count = sum(part.reader.count for part in parts)
-    found = sum(part.reader.count for part in parts if part.reader.antialiased)
-    most = 2 * found > count
-    if found in (0, count):
-        return most, ()
-    kind = "antialiased" if most else "not antialiased"
-    text = f"{found:,} of {count_of(count, 'splat')} are antialiased, and the others are not; all are written as {kind}"
-    return most, (text,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,17 +100,17 @@ class FillMerged:
                     progress("reading", done, len(target.splats), "splat")
 
 
-#: Run of splats of a file: the first, their number, and the row that the first of them gets.
+#: Run of splats of a file: number of the first, number of splats, and row of the first in the scene.
 Piece = tuple[int, int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class Chunk(Reader):
-    """A splat file that a manifest names, which is opened for each read, and the pieces of it to read.
+    """Splat file that a manifest names, opened for each read, and the pieces of it to read.
 
     Attributes:
         name: path relative to the manifest's folder.
-        bytes: of the file and the files that it names.
+        bytes: size of the file and of the files that it names.
     """
 
     name: str = ""
@@ -135,10 +128,10 @@ class SceneFiles:
     """Splat files beside a manifest: chunks of a Streamed SOG, tiles of 3D Tiles.
 
     Attributes:
-        open_companion: opens them; None where there are no other files to open.
-        manifest: its name in messages.
-        code: of the finding that one cannot be read.
-        open_content: reads the header of one, given its name, too.
+        open_companion: opens a file by name; None if no other files can be opened.
+        manifest: name of the manifest in messages.
+        code: code of the finding that a file cannot be read.
+        open_content: reads the header of a file with a name.
     """
 
     open_companion: OpenCompanion | None
@@ -147,7 +140,7 @@ class SceneFiles:
     open_content: Callable[[str, OpenFile], Reader]
 
     def open(self, name: str, pieces: Sequence[Piece] | None = None, row: int = 0) -> Chunk:
-        """Read the header of a file, which errors name; its pieces are those to read later, None for all of it."""
+        """Read the header of a file, to read its `pieces` later, by default all splats from `row` on."""
         with self._opened(name) as source:
             content = self.open_content(name, source)
         facts, expected = vars(content), (content.count, content.sh_degree)
@@ -166,10 +159,7 @@ class SceneFiles:
     def read(
         self, chunks: Sequence[Chunk], out: Splats, threads: int = 1, progress: Progress = silent, first_row: int = 0
     ) -> None:
-        """Fill all rows of `out`, the first of which is `first_row` of the pieces, several files at a time.
-
-        SH coefficients that a file does not have become 0. Errors name the file.
-        """
+        """Read pieces of several files at a time into `out`, whose first row is `first_row`; errors name the file."""
         together = min(threads, len(chunks))
 
         def work(chunk: Chunk) -> int:
@@ -235,7 +225,7 @@ class SceneFiles:
         threads: int = 1,
         progress: Progress = silent,
     ) -> Iterator[RuleViolation]:
-        """Decode files one at a time, and yield the `rules` that their splats break."""
+        """Decode files one at a time, and yield the violations that `rules` finds in their splats."""
         total, done = sum(chunk.count for chunk in chunks), 0
         for chunk in chunks:
             splats = Splats.empty(chunk.rows, chunk.sh_degree)
@@ -250,7 +240,7 @@ class SceneFiles:
 
     @contextlib.contextmanager
     def _opened(self, name: str) -> Iterator[OpenFile]:
-        """Open a file, and what opens the files beside it; errors of the body name it."""
+        """Open a file, with the way to open the files that it names; errors of the body name it."""
         if self.open_companion is None:
             raise FormatError(f"{self.manifest} names {quoted_value(name)}, but other files cannot be opened here")
         open_companion, folder = self.open_companion, posixpath.dirname(name)
@@ -272,7 +262,7 @@ class SceneFiles:
 
 
 def not_finite(chunk: Chunk, splats: Splats) -> RuleViolation | None:
-    """Return the violation of a file that has splats with a number that is not finite; None if all are."""
+    """Return the violation of a file with numbers that are not finite; None if all are finite."""
     invalid = splats.invalid()
     if not invalid:
         return None

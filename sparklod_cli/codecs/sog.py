@@ -147,14 +147,11 @@ class SogFiles:
 
     def lossy(self) -> list[str]:
         """Return the names of the images with lossy compression."""
-        return [name for name in image_names(self.meta) if self._is_lossy(name)]
-
-    def _is_lossy(self, name: str) -> bool:
-        try:
-            with self._file(name, whole=False) as file:
-                return read_header(file.read, name).lossy
-        except FormatError:  # which reading the splats reports
-            return False
+        found = list[str]()
+        for name in image_names(self.meta):
+            with contextlib.suppress(FormatError), self._file(name, whole=False) as file:  # reading reports errors
+                found += [name] if read_header(file.read, name).lossy else []
+        return found
 
     def bytes_of(self, texture: str, index: int) -> int:
         """Return the stored size of an image in bytes."""
@@ -272,6 +269,12 @@ def _steps(meta: Json, version: int, palette: SogPalette | None) -> list[Step]:
         texels.look_up(pixels, RED_GREEN_BLUE, rgb, splats.rgb)
         texels.look_up(pixels, ALPHA, opacity[None], splats.opacity[:, None])
 
+    def sh(splats: Splats, pixels: Pixels) -> str | None:
+        assert palette is not None
+        rows = palette.values().reshape(palette.entries, -1)
+        largest = texels.gather_rows(pixels, rows, splats.sh.reshape(len(splats), -1))
+        return f"an SH label is beyond the {len(rows):,} entries of its palette" if largest >= len(rows) else None
+
     steps = [
         Step("means", 0, functools.partial(words, 0)),
         Step("means", 1, functools.partial(words, 1)),
@@ -279,14 +282,7 @@ def _steps(meta: Json, version: int, palette: SogPalette | None) -> list[Step]:
         Step("scales", 0, lambda splats, pixels: texels.look_up(pixels, RED_GREEN_BLUE, scales, splats.scale)),
         Step("sh0", 0, color),
     ]
-    return steps if palette is None else [*steps, Step("shN", 1, functools.partial(_fill_sh, palette))]
-
-
-def _fill_sh(palette: SogPalette, splats: Splats, pixels: Pixels) -> str | None:
-    values = palette.values()
-    rows = values.reshape(len(values), -1)
-    largest = texels.gather_rows(pixels, rows, splats.sh.reshape(len(splats), -1))
-    return f"an SH label is beyond the {len(rows):,} entries of its palette" if largest >= len(rows) else None
+    return steps if palette is None else [*steps, Step("shN", 1, sh)]
 
 
 def _tables(meta: Json, name: str, version: int, channels: int) -> FloatArray:

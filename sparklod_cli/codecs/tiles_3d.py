@@ -122,16 +122,15 @@ def _read(file: BinaryIO, open_companion: OpenCompanion | None) -> Tileset:
 
 def _hierarchy(tileset: Tileset) -> tuple[list[int], NDArray[np.int32], NDArray[np.int32]]:
     """Return the tiles without nested tilesets by depth, and the places of their parents and depths."""
-    tiles, order, parent, level = tileset.tiles, list[int](), list[int](), list[int]()
+    order, parent, level = list[int](), list[int](), list[int]()
     frontier = [(0, -1)]
     while frontier:
         following = list[tuple[int, int]]()
         depth = level[-1] + 1 if level else 0
         for number, above in frontier:
-            while tiles[number].is_nested and tiles[number].children:
-                (number,) = tiles[number].children
-            following += [(child, len(order)) for child in tiles[number].children]
-            order.append(number)
+            tile = tileset.root_of(number)
+            following += [(child, len(order)) for child in tileset.tiles[tile].children]
+            order.append(tile)
             parent.append(above)
             level.append(depth)
         frontier = following
@@ -240,8 +239,10 @@ def _tilesets(
         in_folder[tile] |= in_folder[scene.parent[tile]]
     children: list[list[JsonObject]] = [[] for _ in range(scene.tiles)]
     for tile in reversed(range(scene.tiles)):
+        half_x, half_y, half_z = ((boxes[tile, 1] - boxes[tile, 0]) / 2).tolist()
+        sides = [half_x, 0.0, 0.0, 0.0, half_y, 0.0, 0.0, 0.0, half_z]
         described: JsonObject = {
-            "boundingVolume": {"box": box_of(boxes[tile])},
+            "boundingVolume": {"box": boxes[tile].mean(axis=0).tolist() + sides},
             "geometricError": float(scene.errors[tile]),
             "content": {"uri": f"{'' if in_folder[tile] else TILES + '/'}{names[tile]}.glb"},
         }
@@ -260,12 +261,6 @@ def _tilesets(
             matrix = scene.transform.T.ravel().tolist()
             root = described | ({} if np.array_equal(scene.transform, np.eye(4)) else {"transform": matrix})
             yield TILESET, [_json(_tileset(scene, options, root, max(diagonal, float(scene.errors[0]))))]
-
-
-def box_of(corners: Any) -> list[float]:
-    """Return the numbers of a bounding volume "box": its centre and half sides."""
-    (a, b, c), (d, e, f) = (corners.mean(axis=0).tolist(), ((corners[1] - corners[0]) / 2).tolist())
-    return [a, b, c, d, 0.0, 0.0, 0.0, e, 0.0, 0.0, 0.0, f]
 
 
 def _tileset(scene: TileScene, options: WriteOptions, root: JsonObject, error: float) -> JsonObject:

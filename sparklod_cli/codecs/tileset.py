@@ -126,6 +126,12 @@ class Tileset:
         place = place_of("root", number, parent_of, lambda each: self.tiles[each].children)
         return f"{quoted_value(file)} {place}" if file else place
 
+    def root_of(self, number: int) -> int:
+        """Return the root of its nested tileset for a tile that has one, else the tile itself."""
+        while self.tiles[number].is_nested and self.tiles[number].children:
+            (number,) = self.tiles[number].children
+        return number
+
     def names(self) -> Iterator[str]:
         """Yield the paths of the contents of tiles, relative to the folder of the first file."""
         return (name for tile in self.tiles if (name := tile.name) is not None)
@@ -518,8 +524,8 @@ def _kinds(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Iterator[RuleViolat
             text = f"{quoted_value(chunk.name)} has SH degree {chunk.sh_degree}; the first tile has {first.sh_degree}"
             yield broken("sh", text)
         if chunk.up != first.up:
-            text = f"{quoted_value(chunk.name)} has {_up(chunk)}; the first tile has {_up(first)}"
-            yield broken("kind", text)
+            ups = [f"{each.up} up" if each.up else "no axis noted that points up" for each in (chunk, first)]
+            yield broken("kind", f"{quoted_value(chunk.name)} has {ups[0]}; the first tile has {ups[1]}")
     # The name of the format says whether there is an SPZ in a GLB, see `gltf`.
     needed = SPLAT_EXTENSIONS if any("SPZ" in chunk.format for chunk in chunks.values()) else SPLAT_EXTENSIONS[:1]
     for name, head in tileset.heads.items():
@@ -534,10 +540,6 @@ def _kinds(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Iterator[RuleViolat
                 yield broken("extensions", f"{where} {' and '.join(missing)} in {key} of {CONTENT_GLTF}")
 
 
-def _up(chunk: Chunk) -> str:
-    return "no axis noted that points up" if chunk.up is None else f"{chunk.up} up"
-
-
 def _list(value: object) -> Sequence[object]:
     return value if isinstance(value, list) else ()
 
@@ -547,19 +549,12 @@ def _counts(tileset: Tileset, chunks: Mapping[int, Chunk]) -> Iterator[RuleViola
         if chunk.count > LARGE:
             text = f"{quoted_value(chunk.name)} has {count_of(chunk.count, 'splat')}, more than {LARGE:,}"
             yield broken("large", f"{text}, which take long to load")
-        below = [_stands_for(tileset, child) for child in tileset.tiles[number].children]
+        below = [tileset.root_of(child) for child in tileset.tiles[number].children]
         if below and all(child in chunks for child in below):
             total = sum(chunks[child].count for child in below)
             if total < chunk.count:
                 text = f"the children of {tileset.place(number)} have {count_of(total, 'splat')}"
                 yield broken("decreasing", f"{text}, and it has {chunk.count:,}")
-
-
-def _stands_for(tileset: Tileset, number: int) -> int:
-    """Return the root of its nested tileset for a tile that has one, else the tile itself."""
-    while tileset.tiles[number].is_nested and tileset.tiles[number].children:
-        (number,) = tileset.tiles[number].children
-    return number
 
 
 def scan_splats(

@@ -435,7 +435,16 @@ def chunk_violations(header: RadHeader, number: int, chunk: RadChunkHeader, size
         yield broken("kind", f"{name} has {_kind_of(chunk)}, but the file {_kind_of(header)}")
     if chunk.encoding != header.encoding:
         yield broken("ranges", f"splatEncoding of {name} is not that of the file")
-    yield from _payload(number, chunk, size - chunk.bytes)
+    at, payload = 0, size - chunk.bytes
+    for each in chunk.properties:
+        subject, end = f"property {quoted_value(each.name)} of {name}", each.offset + each.bytes
+        if each.offset != at:
+            yield broken("offsets", f"{subject} begins at {each.offset:,}, not at {at:,}, where the one before ends")
+        at = end + padding(each.bytes)
+        if end > payload:
+            yield broken("sizes", f"{subject} ends at {end:,}, of {payload:,} bytes")
+    if at < payload:
+        yield broken("sizes", f"the properties of {name} end at {at:,}, of {payload:,} bytes", fatal=False)
     yield from _names(header, number, [each.name for each in chunk.properties])
     for each in chunk.properties:
         yield from _encodings(each, f"property {quoted_value(each.name)} of {name}")
@@ -443,20 +452,6 @@ def chunk_violations(header: RadHeader, number: int, chunk: RadChunkHeader, size
 
 def _kind_of(header: RadHeader | RadChunkHeader) -> str:
     return f"SH degree {header.max_sh} and {'a tree' if header.lod_tree else 'no tree'}"
-
-
-def _payload(number: int, chunk: RadChunkHeader, payload: int) -> Iterator[RuleViolation]:
-    at = 0
-    for each in chunk.properties:
-        subject = f"property {quoted_value(each.name)} of chunk {number:,}"
-        if each.offset != at:
-            yield broken("offsets", f"{subject} begins at {each.offset:,}, not at {at:,}, where the one before ends")
-        at = each.offset + each.bytes + padding(each.bytes)
-        if each.offset + each.bytes > payload:
-            yield broken("sizes", f"{subject} ends at {each.offset + each.bytes:,}, of {payload:,} bytes")
-    if at < payload:
-        text = f"the properties of chunk {number:,} end at {at:,}, of {payload:,} bytes"
-        yield broken("sizes", text, fatal=False)
 
 
 def _names(header: RadHeader, number: int, names: list[str]) -> Iterator[RuleViolation]:

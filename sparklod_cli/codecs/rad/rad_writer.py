@@ -481,24 +481,6 @@ class StoredChunk:
     codes: Mapping[str, Bytes]
 
 
-def _like(header: RadHeader, first: Mapping[str, Property], options: WriteOptions) -> WriteOptions:
-    """Return the options with open choices set as in the first chunk of a file.
-
-    The rounding of centres stays open if their encoding is that of "auto": it matters for merged splats.
-    """
-    rad, found = options.rad, encodings_of(first.values())
-    if found.get("center") == AUTOMATIC.center:
-        found["center"] = AUTO
-    chosen: dict[str, Any] = {name: found.get(name, AUTO) for name in RAD_ENCODINGS if getattr(rad, name) == AUTO}
-    ranges = rad.ranges or header.encoding or SplatEncoding(lod_opacity=True)
-    for name, low, high in (("rgb", "rgb_min", "rgb_max"), ("scales", "ln_scale_min", "ln_scale_max")):
-        each = first.get(name) if rad.ranges is None else None
-        if each is not None and CODINGS[each.encoding].ends and each.min is not None and each.max is not None:
-            ends: dict[str, Any] = {low: each.min, high: each.max}
-            ranges = dataclasses.replace(ranges, **ends)
-    return dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, ranges=ranges))
-
-
 def stored(source: OpenFile, options: WriteOptions) -> tuple[list[StoredChunk], WriteOptions]:
     """Read the codes of a file; return them and the options with open choices set as in the file."""
     reader, chunks = RadReader.open(source.file, source.open_companion), []
@@ -511,7 +493,18 @@ def stored(source: OpenFile, options: WriteOptions) -> tuple[list[StoredChunk], 
                 flat = _flat(packed.unpacked(each, row, count), each.encoding, count)
                 codes[row.name] = np.ascontiguousarray(_by_splat(flat, row, each.encoding))
         chunks.append(StoredChunk(packed.header.base, properties, codes))
-    return chunks, _like(reader.header, chunks[0].properties, options)
+    rad, first = options.rad, chunks[0].properties
+    found = encodings_of(first.values())
+    if found.get("center") == AUTOMATIC.center:
+        found["center"] = AUTO  # its rounding stays open: it matters for merged splats
+    chosen: dict[str, Any] = {name: found.get(name, AUTO) for name in RAD_ENCODINGS if getattr(rad, name) == AUTO}
+    ranges = rad.ranges or reader.header.encoding or SplatEncoding(lod_opacity=True)
+    for name, low, high in (("rgb", "rgb_min", "rgb_max"), ("scales", "ln_scale_min", "ln_scale_max")):
+        own = first.get(name) if rad.ranges is None else None
+        if own is not None and CODINGS[own.encoding].ends and own.min is not None and own.max is not None:
+            ends: dict[str, Any] = {low: own.min, high: own.max}
+            ranges = dataclasses.replace(ranges, **ends)
+    return chunks, dataclasses.replace(options, rad=dataclasses.replace(rad, **chosen, ranges=ranges))
 
 
 def _flat(codes: NDArray[Any], encoding: str, count: int) -> Bytes:
