@@ -23,7 +23,7 @@ from PIL import Image
 import sparklod_cli
 from fixtures import by_hand_sog
 from sparklod_cli.cli import run
-from sparklod_cli.codecs import sog, sog_images
+from sparklod_cli.codecs import sog
 from sparklod_cli.codecs.formats import SogOptions, WriteOptions
 from sparklod_cli.codecs.sog_images import MOST_BEFORE, pixels_of, read_header
 from sparklod_cli.io.reading import read_scene
@@ -422,15 +422,6 @@ def test_a_palette_has_as_many_codes_as_suit_or_as_are_asked_for(codes: int | No
 def test_palettes_are_as_large_as_those_of_splat_transform() -> None:
     expected = {1: 1024, 1024: 1024, 2047: 1024, 2048: 2048, 5000: 4096, 65_535: 32_768, 65_536: 65_536, 10**8: 65_536}
     assert {count: sog.codes_for(count) for count in expected} == expected
-
-
-@pytest.mark.parametrize("count", [1, 15, 16, 17, 4096, 4097, 500_000, 16_380**2])
-def test_images_hold_all_splats_in_about_a_square(count: int) -> None:
-    width, height = sog.size_for(count)
-    assert width * height >= count
-    assert (width % 4, height % 4) == (0, 0)
-    assert height <= width <= sog_images.MAX_SIDE
-    assert width * (height - 4) < count
 
 
 def changed(**columns: np.ndarray) -> Scene:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import io
 import json
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from fixtures import by_hand_sog, by_hand_streamed_sog
 from sparklod_cli.codecs import sog, streamed_manifest, streamed_sog
 from sparklod_cli.codecs.formats import DEFAULTS, is_of_streamed_sog, sniff
 from sparklod_cli.codecs.merging import SceneFiles
-from sparklod_cli.codecs.streamed_manifest import LARGEST, Manifest, ManifestNode, Run, parse, serialise
+from sparklod_cli.codecs.streamed_manifest import LARGEST, Manifest, ManifestNode, parse, serialise
 from sparklod_cli.io.reading import open_reader, read_parts, read_scene
 from sparklod_cli.io.writing import parts_output
 from sparklod_cli.model import morton
@@ -107,19 +106,6 @@ def test_full_detail_is_level_0_and_the_environment_and_needs_no_other_chunk() -
     assert_same(read_full(files).splats, whole.splats)
     with pytest.raises(FormatError, match="there is no '1_0"):
         read_levels(files)
-
-
-@pytest.mark.parametrize("block", [7, 60, 1 << 17])
-def test_blocks_of_any_range_are_rows_of_the_scene(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sparklod_cli.codecs.reader.BLOCK_SPLATS", block)
-    expected = read_scene(GOLDEN).splats
-    with open_reader(GOLDEN / "lod-meta.json", threads=2) as reader:
-        assert (reader.count, reader.sh_degree) == (66, 1)
-        for start, stop in ((0, 66), (20, 30), (44, 66), (59, 61), (5, 6), (3, 3), (0, 45), (45, 60), (60, 66)):
-            blocks = list(reader.blocks(start, stop))
-            assert all(len(each) <= block for each in blocks)
-            if start < stop:
-                assert_same(Splats.concat(blocks), expected.take(slice(start, stop)))
 
 
 def test_blocks_decode_each_chunk_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,27 +234,6 @@ def parsed(**changes: Any) -> Manifest:
 
 def leaf(**changes: Any) -> dict[str, Any]:
     return {"bound": BOUND, "lods": {"1": {"file": 0, "offset": 0, "count": 3} | changes}}
-
-
-def test_nodes_are_in_the_order_of_the_file_root_first() -> None:
-    manifest = parsed(environment="env/meta.json", count=7)
-    assert [node.children for node in manifest.nodes] == [(1, 2), (), (3, 4), (), ()]
-    assert [node.parent for node in manifest.nodes] == [-1, 0, 0, 2, 2]
-    assert (manifest.place(0), manifest.place(4)) == ("tree", "tree.children[1].children[1]")
-    assert [number for number, _ in manifest.regions()] == [1, 3, 4]
-    runs = {0: Run(0, 0, 3), 1: Run(1, 4, 2)}
-    assert manifest.nodes[1] == ManifestNode(((-1, 0, 0.5), (1, 2, 3e5)), (), runs, None, 0)
-    assert manifest.names() == ["0_0/meta.json", "1_0/meta.json", "env/meta.json"]
-    assert manifest.head == {"version": 1, "count": 7}
-
-
-@pytest.mark.parametrize(
-    "bound",
-    [None, [], {"min": [0, 0, 0]}, {"min": [0, 0], "max": [1, 1, 1, 1]}, {"min": [0, 0, True], "max": [1, 1, 1]}]
-    + [{"min": [0, 0, 0], "max": [1, 1, number]} for number in (math.nan, math.inf, "1", None, [])],
-)
-def test_a_bound_of_other_than_six_finite_numbers_is_parsed_as_none(bound: Any) -> None:
-    assert parsed(tree=leaf() | {"bound": bound}).nodes[0].bound is None
 
 
 LEVELS, SPLATS = "expected a whole number from 1 to 32", "expected a whole number from 0 to 268,435,456"
