@@ -32,11 +32,7 @@ class RuleViolation:
 
 
 def violation(readable: Collection[str], format: str, code: str, text: str, fatal: bool | None = None) -> RuleViolation:
-    """Return a violation of a rule by the name of the format and of the rule.
-
-    Args:
-        readable: codes whose violations are not `fatal`, unless that is given.
-    """
+    """Return a violation of a rule of a format, fatal unless its code is `readable` or `fatal` says otherwise."""
     code = f"{format}.{code}"
     return RuleViolation(code, text, code not in readable if fatal is None else fatal)
 

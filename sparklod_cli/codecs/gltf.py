@@ -200,11 +200,7 @@ def _are_logs(scales: FloatArray, generator: object) -> bool:
 
 
 def _doubt_about(scales: FloatArray, centers: FloatArray, count: int) -> str | None:
-    """Return a note on positive scales that are read as linear but may be logarithms; None if they seem linear.
-
-    Args:
-        scales, centers: (n, 3) values of splats sampled all over a file of `count` splats.
-    """
+    """Return a note if positive (n, 3) scales, sampled in a file of `count` splats, may be logarithms; else None."""
     if count < LEAST or not (np.isfinite(scales).all() and np.isfinite(centers).all() and (scales > 0).all()):
         return None
     low, middle, high = np.quantile(scales.astype(np.float64), (0.01, 0.5, 0.99))
@@ -238,8 +234,7 @@ def open_content(source: OpenFile) -> Reader:
     file has no note, the axis is unknown, as it was when the file was written.
 
     Raises:
-        FormatError: the file is no glTF, has no splats, uses something of glTF that is not read, or is cut short or
-            corrupt.
+        FormatError: the file is no glTF with splats, is damaged, or uses a part of glTF that is not read.
     """
     file = GltfFile(source)
     primitives = _primitives(file)
@@ -442,11 +437,7 @@ def extensions_of(profile: str | None) -> list[str]:
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """Return the options with nothing left open, also those of the SPZ in the profile "cesium".
-
-    Raises:
-        FormatError: the scene is a tree, has an opacity above 1, which glTF forbids, or does not fit.
-    """
+    """Return the options with nothing left open, also of SPZ inside; `FormatError` if glTF cannot hold the scene."""
     if scene.tree is not None:
         raise FormatError("GLB holds no Level-of-Detail tree")
     splats = scene.splats
@@ -467,12 +458,9 @@ def held(options: WriteOptions, sh_degree: int) -> Sequence[CodeRange]:
 def encode(
     scene: Scene, options: WriteOptions = DEFAULTS, *, threads: int = 1, progress: Progress = silent
 ) -> Iterator[bytes]:
-    """Encode a GLB piece by piece; its root node turns the up axis, if known, to y.
+    """Encode a GLB piece by piece, whose root node turns a known up axis to y; raises as `settled`.
 
     The same scene and options give the same bytes for any number of threads.
-
-    Raises:
-        FormatError: see `settled`.
     """
     options = settled(scene, options)
     splats, count = scene.splats, len(scene.splats)

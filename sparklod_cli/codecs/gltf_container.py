@@ -16,9 +16,9 @@ import posixpath
 import re
 import struct
 import urllib.parse
-from collections.abc import Collection, Container, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -272,10 +272,9 @@ class GltfFile:
         return number, buffer.start + offset, length, view.optional("byteStride", _bytes)
 
     def accessor(self, index: Any, kind: str, components: tuple[int, ...]) -> Accessor:
-        """Return an accessor; `FormatError` if values are outside of its buffer view.
+        """Return an accessor by its number in the JSON; `FormatError` for other types or values outside of its view.
 
         Args:
-            index: value in the JSON, a number or anything else.
             kind: expected type, such as "VEC3".
             components: expected component types.
         """
@@ -342,6 +341,7 @@ def check_length(total: int) -> None:
 
 
 Matrix = NDArray[np.float64]
+T = TypeVar("T")
 
 #: Rotations x y z w that turn an axis to +y: about x, so that right stays right; the x axis itself about z.
 HALF = math.sqrt(0.5)
@@ -380,22 +380,22 @@ class GltfNodes:
         """
         nodes = enumerate(self.records)
         having = [number for number, node in nodes if type(node.get("mesh")) is int and node["mesh"] in meshes]
-        for number in having:
-            for each in self._down_to(number, self._is_shown):
-                parent = self._parent.get(each)
-                self._is_shown[each] = each in self._shown if parent is None else self._is_shown[parent]
-        shown = [number for number in having if self._is_shown[number]]
+        shown = [number for number in having if self._inherited(number, self._is_shown, self._shows)]
         return (shown, len(having) - len(shown)) if shown else (having, 0)
 
     def matrix(self, number: int) -> Matrix:
         """Return the (4, 4) matrix of a node to the scene, for column vectors."""
-        for each in self._down_to(number, self._matrices):
-            own, parent = _matrix(self.records[each]), self._parent.get(each)
-            self._matrices[each] = own if parent is None else product(self._matrices[parent], own)
-        return self._matrices[number]
+        return self._inherited(number, self._matrices, self._placed)
 
-    def _down_to(self, number: int, known: Container[int]) -> Iterator[int]:
-        """Yield a node and its ancestors that are not in `known`, from the top down."""
+    def _shows(self, number: int, above: bool | None) -> bool:
+        return number in self._shown if above is None else above
+
+    def _placed(self, number: int, above: Matrix | None) -> Matrix:
+        own = _matrix(self.records[number])
+        return own if above is None else product(above, own)
+
+    def _inherited(self, number: int, known: dict[int, T], derive: Callable[[int, T | None], T]) -> T:
+        """Return the value of a node, derived from that of its parent, None without one; `known` keeps values."""
         line, at = dict[int, None](), number
         while at not in known:
             if at in line:
@@ -404,7 +404,10 @@ class GltfNodes:
             if at not in self._parent:
                 break
             at = self._parent[at]
-        yield from reversed(line)
+        for each in reversed(line):
+            parent = self._parent.get(each)
+            known[each] = derive(each, None if parent is None else known[parent])
+        return known[number]
 
 
 def _roots_of_scene(file: GltfFile) -> frozenset[int]:
@@ -447,12 +450,7 @@ def _numbers(node: dict[str, Any], name: str, count: int, default: tuple[float, 
 
 
 def transform_of(matrix: Matrix) -> Transform:
-    """Split a (4, 4) matrix into a rotation, a uniform scale and a translation.
-
-    Raises:
-        FormatError: it is singular, or out of the range of a `Transform`.
-        UnsupportedError: it stretches, shears or mirrors.
-    """
+    """Split a (4, 4) matrix into rotation, uniform scale and translation; `FormatError` if that is impossible."""
     axes = matrix[:3, :3]
     with np.errstate(all="ignore"):
         determinant = float(np.linalg.det(axes))

@@ -205,12 +205,7 @@ class SceneFiles:
         notes: Iterable[str],
         threads: int,
     ) -> Reader:
-        """Return a reader of the splats of files, one after the other.
-
-        Args:
-            size: bytes of the files that name them.
-            notes: those about the scene, before the notes about files.
-        """
+        """Return a reader of files, one after the other; `size` and `notes` are those of the manifest."""
         degree, size = max(chunk.sh_degree for chunk in chunks), size + sum(chunk.bytes for chunk in chunks)
         count, header = sum(chunk.rows for chunk in chunks), {**header, "bytes": size}
         check_promise(count * 4 * width_of(degree), size)
@@ -333,11 +328,7 @@ class ZipFolder:
 
     @contextlib.contextmanager
     def opened(self, name: str, *, whole: bool = True) -> Iterator[IO[bytes]]:
-        """Open a member.
-
-        Args:
-            whole: read to its end at last, so that the checksum is checked; False if only its beginning is needed.
-        """
+        """Open a member; `whole` reads it to its end at last, which checks the checksum."""
         member = self._member(name)
         if member.compress_type not in METHODS or member.flag_bits & ENCRYPTED:
             raise FormatError(f"{quoted_value(name)} is encrypted, or compressed by a method that is not read")

@@ -191,11 +191,7 @@ class Step(NamedTuple):
 
 
 def open_content(source: OpenFile) -> Reader:
-    """Open a .sog archive, or the meta.json of an unpacked one; reading blocks unpacks images to `scratch`.
-
-    Raises:
-        FormatError: the file is not SOG, not of version 1 or 2, corrupt, or lacks an image.
-    """
+    """Open a .sog archive, or the meta.json of an unpacked one; `FormatError` if it is no complete SOG 1 or 2."""
     files = SogFiles(source.file, source.open_companion)
     meta = files.meta
     version = meta.whole("version") if has(meta, "version") else 1
@@ -390,11 +386,7 @@ def codes_for(count: int) -> int:
 
 
 def settled(scene: Scene, options: WriteOptions) -> WriteOptions:
-    """Return the options with nothing left open.
-
-    Raises:
-        FormatError: the scene has a tree or no splats, or SOG cannot hold its values or number of splats.
-    """
+    """Return the options with nothing left open; `FormatError` if SOG cannot hold the scene."""
     codes, splats = options.sog.sh_codes, scene.splats
     if scene.tree is not None:
         raise FormatError("SOG holds no Level-of-Detail tree")
@@ -430,11 +422,7 @@ def encode_files(
     progress: Progress = silent,
     in_order: bool = False,
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield the name and bytes of each file of an unpacked SOG, meta.json last.
-
-    Args:
-        in_order: keep the order of splats; otherwise they are in Morton order.
-    """
+    """Yield the name and bytes of each file of an unpacked SOG, meta.json last; in Morton order unless `in_order`."""
     options = settled(scene, options)
     splats = scene.splats
     low, high = (codings.sign_log(end) for end in (splats.center.min(axis=0), splats.center.max(axis=0)))

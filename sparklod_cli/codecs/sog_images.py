@@ -117,12 +117,8 @@ def codebook(values: FloatArray, tilt: float = 0) -> FloatArray:
 def even_codebook(values: FloatArray) -> FloatArray:
     """Choose the book with the least maximum error: the middles of equally wide intervals that cover all numbers.
 
-    Args:
-        values: finite float32 of any shape, with more than 256 different ones.
-
-    Returns:
-        (256,) ascending float32. The first one is the least value, such as the logarithm of 0; the last one is repeated
-        where there are fewer.
+    The first of the (256,) ascending float32 is the least value, such as the logarithm of 0; the last one is repeated
+    if fewer suffice. More than 256 of the finite `values` must differ.
     """
     least, *rest = np.unique(values).astype(np.float64)
     ordered = np.array(rest)
@@ -236,11 +232,7 @@ def _up_to_pixels(data: bytes, read: Read) -> tuple[bytes, bool]:
 
 
 def pixels_of(header: WebPHeader, read: Read, name: str) -> Pixels:
-    """Decode (width * height,) pixels, row by row, which libwebp allocates: check the sides before.
-
-    Args:
-        read: reads the bytes after the header.
-    """
+    """Decode (width * height,) pixels from the bytes after the header; libwebp allocates them: check sides before."""
     data = header.start + b"".join(iter(lambda: read(PIECE), b""))
     try:
         # Not by Image.open, which warns of large images and refuses larger ones.

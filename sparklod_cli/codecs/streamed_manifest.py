@@ -282,11 +282,7 @@ def violations(manifest: Manifest) -> Iterator[RuleViolation]:
 
 
 def file_violations(manifest: Manifest, files: Mapping[str, Chunk | str]) -> Iterator[RuleViolation]:
-    """Yield the rules that chunk files break.
-
-    Args:
-        files: header of each by name, or why it cannot be read.
-    """
+    """Yield the rules that chunk files break, by the header of each, or why it cannot be read."""
     ends = [0] * len(manifest.filenames)
     for _, runs, _ in regions_of(manifest):
         for run in runs.values():
@@ -471,13 +467,10 @@ def files_of_chunk(open_companion: OpenCompanion, name: str) -> list[str]:
 def scan_files(
     file: BinaryIO, open_companion: OpenCompanion
 ) -> tuple[Manifest, dict[str, Chunk | str], list[RuleViolation]]:
-    """Read a manifest and the headers of the files that it names.
+    """Read a manifest and the headers of its files; `FormatError` if the manifest cannot be parsed.
 
     Returns:
         the manifest; the header of each file by name, or why it cannot be read; and the rules that they break.
-
-    Raises:
-        FormatError: the manifest cannot be parsed.
     """
     manifest = parse(file.read(MAX_MANIFEST + 1))
     found, beside = list(violations(manifest)), chunk_files(open_companion)

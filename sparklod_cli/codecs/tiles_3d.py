@@ -66,11 +66,7 @@ def open_content(source: OpenFile) -> Reader:
 def decode_parts(
     file: BinaryIO, *, threads: int = 1, progress: Progress = silent, open_companion: OpenCompanion | None = None
 ) -> TileScene:
-    """Read all tiles by level, their depth in the tree; a tile with a nested tileset is one with the nested root.
-
-    Raises:
-        FormatError: as `open_content`; or a bounding volume is a region, or a number is wrong.
-    """
+    """Read all tiles by level, their depth in the tree; a tile with a nested tileset is one with the nested root."""
     source = OpenFile(file, open_companion, threads=threads)
     tileset = _read(file, open_companion)
     order, parent, level = _hierarchy(tileset)

@@ -282,12 +282,9 @@ Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
 def to_tileset(up: str | None) -> NDArray[np.float64]:
-    """Return the (3, 3) rotation from the axes of splats in a GLB to those of the tileset.
+    """Return the (3, 3) rotation from the axes of splats in a GLB, by their up axis, to those of the tileset.
 
     Its entries are 0, 1 and -1, so that boxes stay boxes.
-
-    Args:
-        up: axis of the splats that points up; None for y.
     """
     return Y_TO_Z @ rotation_of_up(up)
 

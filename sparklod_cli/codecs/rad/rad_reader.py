@@ -54,11 +54,7 @@ class RadReader:
 
     @classmethod
     def open(cls, file: BinaryIO, open_companion: OpenCompanion | None = None) -> RadReader:
-        """Read and check the header of a file, and read its palette.
-
-        Raises:
-            FormatError: the file is not RAD, breaks a fatal rule, or its first chunk is damaged.
-        """
+        """Read the header of a file and its palette; `FormatError` if a fatal rule or the first chunk is broken."""
         header, violations = scan_header(file, open_companion)
         check_rules(violations)
         check_promise(decoded_bytes(header), header.bytes + sum(entry.bytes for entry in header.chunks))
@@ -186,11 +182,7 @@ class RadReader:
         return leaves
 
     def scan_chunks(self, *, paddings: bool) -> Iterator[tuple[RadChunkHeader | None, list[RuleViolation]]]:
-        """Yield the header of each chunk, None if it is unreadable, and the rules that it breaks.
-
-        Args:
-            paddings: also check the bytes between properties.
-        """
+        """Yield the header of each chunk, None if it is unreadable, and its broken rules, also about `paddings`."""
         for number, entry in enumerate(self.header.chunks):
             with self._opened(entry) as (file, start):
                 file.seek(start)

@@ -320,11 +320,7 @@ class RadEncoder:
     def _coded(
         self, row: Row, splats: Splats, tree: LodTree | None, labels: NDArray[np.uint32] | None, start: int
     ) -> tuple[str, NDArray[Any], float | None, float | None]:
-        """Encode a property of the chunk that begins with node `start`, without compression.
-
-        Returns:
-            the encoding; codes of any shape; and the ends of their range, None without one.
-        """
+        """Encode a property from node `start` on; return encoding, codes, and the ends of their range or None."""
         encoding = getattr(self.options.rad, row.option) if row.option else row.encodings[0]
         coding, stop = CODINGS[encoding], start + len(splats)
         values = self.values(row, encoding, splats, tree, labels)
