@@ -391,10 +391,6 @@ def _of_arrays(
     return report, scene if scene.tree is None else None
 
 
-class ExpectationError(SparklodError):
-    """A file of expectations holds something else than assertions about reports."""
-
-
 #: Short names for values of a report, in addition to its fields.
 SHORT_NAMES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "nodes": lambda report: report["splats"],
@@ -452,7 +448,7 @@ def read_expectations(path: Path) -> list[Assertion]:
     """Read assertions from a text file, one a line; blank lines and lines that begin with # are skipped.
 
     Raises:
-        ExpectationError: a line is not an assertion about a report; for TOML or JSON, it suggests the assertions.
+        SparklodError: a line is not an assertion about a report; for TOML or JSON, it suggests the assertions.
     """
     text = read_text(path)
     found = []
@@ -463,9 +459,9 @@ def read_expectations(path: Path) -> list[Assertion]:
             found.append(parse_expectation(line))
         except BadAssertionError as error:
             if path.suffix.lower() not in (".toml", ".json"):
-                raise ExpectationError(f"{path}, line {number}: {quoted(error)}") from None
+                raise SparklodError(f"{path}, line {number}: {quoted(error)}") from None
             lines = [REPLACED_KEYS[key] + value.replace("_", "") for key, value in OLD_KEY.findall(text)]
-            raise ExpectationError(
+            raise SparklodError(
                 f"{path} has expectations as TOML or JSON, which are no longer read; write assertions, one a line: "
                 + printable(", ".join([*lines, "NAME==VALUE, NAME>=MIN and NAME<=MAX for values"]), 2 * QUOTED)
             ) from None

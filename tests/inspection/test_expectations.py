@@ -10,7 +10,6 @@ import pytest
 
 from sparklod_cli.cli import run
 from sparklod_cli.inspection.report import (
-    ExpectationError,
     NoFieldError,
     Report,
     ReportSettings,
@@ -170,13 +169,6 @@ def test_files_are_checked_with_their_expectations(arguments: str, status: int, 
     assert found.startswith(out) if out else not found
 
 
-def test_leaves_can_be_those_of_another_file(tmp_path: Path, capsys: Capture) -> None:
-    splats = tmp_path / "splats.spz"
-    assert run(["convert", str(TREE), str(splats), "--leaves", "-q"]) == 0
-    assert run(["inspect", str(TREE), "--leaves-of", str(splats)]) == 0
-    assert capsys.readouterr().out == ""
-
-
 @pytest.mark.parametrize("original", ["missing.ply", FIXTURES / "points.ply"])
 def test_an_original_that_cannot_be_read_is_named(original: object, capsys: Capture) -> None:
     assert run(["inspect", str(TREE), "--leaves-of", str(original)]) == 1
@@ -212,7 +204,7 @@ OLD_JSON = '{"max_bytes": 1000, "min_splats":1, "max_splats": 10, "sh": 0, "lod"
 
 @pytest.mark.parametrize(("name", "text"), [("expect.toml", OLD), ("expect.JSON", OLD_JSON)])
 def test_an_old_file_is_refused_with_its_new_lines(name: str, text: str, tmp_path: Path, tree: Report) -> None:
-    with pytest.raises(ExpectationError, match="as TOML or JSON, which are no longer read") as caught:
+    with pytest.raises(SparklodError, match="as TOML or JSON, which are no longer read") as caught:
         read_expectations(written(tmp_path, text, name))
     lines = "bytes<=1000, leaves>=1, leaves<=10, sh==0, lod==true, growth<=1.5"
     assert f"one a line: {lines}, NAME==VALUE" in str(caught.value)

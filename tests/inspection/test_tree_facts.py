@@ -15,7 +15,7 @@ from sparklod_cli.inspection import tree as facts_of
 from sparklod_cli.inspection.findings import Finding
 from sparklod_cli.inspection.tree import TreeFacts
 from sparklod_cli.lod import quick
-from sparklod_cli.lod.kernels.tree_links import find_depths, find_parents
+from sparklod_cli.lod.kernels.tree_links import find_depths
 from sparklod_cli.model.gaussian import spark_size
 from sparklod_cli.model.lod_tree import LodTree
 from sparklod_cli.model.splats import Splats
@@ -139,21 +139,6 @@ def test_the_coarse_cut_is_a_cut_whatever_the_sizes(most: int, seed: int, fallin
         assert cut == expected
 
 
-def test_facts_of_a_small_tree_are_those_worked_out_by_hand() -> None:
-    """The root has two children, the first of which has three."""
-    splats = sized([8.0, 4.0, 1.0, 1.0, 2.0, 4.0])
-    splats.opacity[:2] = [3.0, 1.0]
-    facts, findings = examine(splats, tree_of([(2, 1), (3, 3), *[(0, 0)] * 4]))
-    assert findings == []
-    assert (facts.leaves, facts.inner, facts.growth, facts.depth) == (4, 2, 1.5, 2)
-    assert [(level.nodes, level.leaves) for level in facts.levels] == [(1, 0), (2, 1), (3, 3)]
-    assert [level.size for level in facts.levels][1:] == [2.0, 2.0]  # geometric means: of 4 and 1, of 1, 2 and 4
-    assert facts.levels[0].size == pytest.approx(8 * (1 + 0.7 * (math.sqrt(1 + math.e * math.log(3)) - 1)), rel=1e-3)
-    assert facts.children == {"2": 1, "3": 1}
-    assert facts.more_than_opaque == round(1 / 6, 4)
-    assert (facts.chunks, facts.chunks_of_coarse_cut) == (1, 1)
-
-
 @pytest.mark.parametrize(
     ("sizes", "links", "leaves", "growth", "levels", "expected"),
     [
@@ -213,20 +198,3 @@ def test_a_rise_is_found_although_a_node_has_no_parent() -> None:
     assert codes(findings) == {"tree.orphan", "tree.coarse-first"}
     (found,) = (each for each in findings if each.code == "tree.coarse-first")
     assert found.index == pytest.approx(1500, abs=3000 / facts_of.PARTS)
-
-
-def test_good_trees_are_far_from_the_bounds() -> None:
-    """Dense and sparse scenes; by the size that Spark writes, and by how far coarse nodes come first."""
-    worst, rise = math.inf, 0.0
-    for extent, base in [(0.1, 1.1), (1.0, 1.5), (30.0, 2.0)]:
-        nodes, tree = quick.build(random_splats(5000, seed=1, extent=extent), base)
-        size = spark_size(nodes)
-        for node in np.flatnonzero(~tree.is_leaf):
-            start = int(tree.child_start[node])
-            worst = min(worst, float(size[node] / size[start : start + int(tree.child_count[node])].max()))
-        _, limit = find_depths(tree.child_count, tree.child_start, size)
-        parent, _ = find_parents(tree.child_count, tree.child_start)
-        wanted = [np.median(part) for part in np.array_split(limit[parent[1:]], facts_of.PARTS)]
-        rise = max(rise, float((wanted[1:] / np.minimum.accumulate(wanted)[:-1]).max()))
-    assert worst > 1.2 * facts_of.MIN_SIZE_RATIO
-    assert rise < facts_of.MAX_RISE / 1.2
