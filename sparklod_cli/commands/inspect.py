@@ -93,7 +93,7 @@ class Checks:
         """Return the assertions of the file and of the options; None without either.
 
         Raises:
-            ExpectationError: a line of the file is not an assertion.
+            SparklodError: a line of the file is not an assertion.
         """
         from ..inspection.report import parse_expectation, read_expectations
         from ..tables.assertions import BadAssertionError

@@ -29,7 +29,7 @@ TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
 #: The scene that all commands start from.
 SCENE = "demo.ply"
 
-#: Pictures of a browser, which `python -m tests.docs.browser_picture` takes.
+#: Pictures of a browser, which `python -m tests.docs.pictures browser` takes.
 OF_A_BROWSER = {"browser.webp"}
 
 #: WebP quality of the pictures of tutorials.

@@ -1,8 +1,9 @@
-"""Docstrings name their subject in the first line, and classes have names of their own."""
+"""Docstrings name their subject in the first line, classes have names of their own, and modules import in no circle."""
 
 from __future__ import annotations
 
 import ast
+import graphlib
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
@@ -82,3 +83,26 @@ def test_shared_names_are_found(tmp_path: Path) -> None:
     (tmp_path / "a.py").write_text("class A: pass\nclass B: pass\n")
     (tmp_path / "b.py").write_text("def f():\n    class A: pass\n")
     assert shared_names(tmp_path) == {"A": ["a.py:1: A", "b.py:2: A"]}
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports_of(path: Path, modules: set[str]) -> Iterator[str]:
+    """Yield the modules of the package that a module imports, wherever the statement stands."""
+    package = path.relative_to(PACKAGE.parent).parent.parts
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            origin = [*package[: len(package) - node.level + 1], *(node.module.split(".") if node.module else ())]
+            for alias in node.names:
+                name = ".".join([*origin, alias.name])
+                yield name if name in modules else ".".join(origin)
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    paths = {module_of(path): path for path in PACKAGE.rglob("*.py")}
+    graph = {name: set(imports_of(path, set(paths))) - {name} for name, path in paths.items()}
+    assert sum(map(len, graph.values())) > len(paths), "imports are not recognised"
+    list(graphlib.TopologicalSorter(graph).static_order())  # raises CycleError, which names the circle
