@@ -193,7 +193,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class ReportBlocks:
-    """A scene, block by block.
+    """Scene that is read block by block.
 
     Attributes:
         about: scene with the metadata of the file, and with the splats and the tree if they are in memory.

@@ -114,7 +114,7 @@ class Numbers:
             self._merge()
 
     def _merge(self) -> None:
-        """Count the kept numbers instead."""
+        """Move the kept numbers to the distribution."""
         values = np.concatenate(self._kept).astype(np.float64)
         self._kept = []
         if self._distribution is None and self._centred:

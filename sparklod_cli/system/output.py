@@ -601,7 +601,7 @@ def _folders_of(names: Iterable[str]) -> list[str]:
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
-    """Remove those of these folders, outermost first, that are empty or have only empty ones of these."""
+    """Remove the empty folders among these, which are listed outermost first."""
     for folder in reversed(list(folders)):
         with contextlib.suppress(OSError):
             folder.rmdir()
