@@ -47,11 +47,8 @@ _INSTALL = f"install sparklod {__version__} with its extra cluster there, and st
 #: Seconds to wait before a failed call is repeated: networks recover, and shared folders show files late.
 PAUSES = (1.0, 5.0)
 
-#: Seconds between checks of the cluster while no call ends.
-TICK = 1.0
-
-#: Seconds after which a cluster without workers is reported.
-ALONE_SECONDS = 10.0
+#: Seconds between checks of the cluster while no call ends, and until a cluster without workers is reported.
+TICK, ALONE_SECONDS = 1.0, 10.0
 
 #: Error numbers that repeating a call does not help: no room, no permission.
 LASTING = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG, errno.ENAMETOOLONG}

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -88,17 +88,17 @@ class InBlocks:
         settings = self.job.settings
         if not self.job.stream.count:
             settings.selection.check(SelectionTally())
-        summary = self._scatter()
+        tally, bounds, sample, statistics = self._scatter()
         tree.end("read")
         assert tree.form is not None
-        tree.form.codec().settled(summary.statistics, tree.options)  # reports a tree that the output cannot hold
+        tree.form.codec().settled(statistics, tree.options)  # reports a tree that the output cannot hold
         setting = getattr(settings, BUILDERS[settings.method].setting)
-        plan = self.job.builder().plan(summary.bounds, splats_of(summary.sample), setting)
+        plan = self.job.builder().plan(bounds, splats_of(sample), setting)
         self.job = job = dataclasses.replace(self.job, plan=plan)
         self.engine.run("building", list(_stages(job)), job, self.progress)
         tree.end("build")
         baked = tree.baked
-        baked.splats, baked.dropped, baked.method = summary.tally.selected, summary.tally.dropped, settings.method
+        baked.splats, baked.dropped, baked.method = tally.selected, tally.dropped, settings.method
         baked.blocks = job.blocks.count
 
     def order(self, tree: BuiltTree) -> None:
@@ -126,8 +126,12 @@ class InBlocks:
         job.store.put(PUBLISHED, {})
         return functools.partial(encoded_array, job.store)
 
-    def _scatter(self) -> InputSummary:
-        """Divide the scene into blocks and sort the splats of the input into them."""
+    def _scatter(self) -> tuple[SelectionTally, Bounds, Rows, Statistics]:
+        """Divide the scene into blocks and sort the splats of the input into them.
+
+        Returns:
+            the tally of all splats; and of the selected ones their bounds, rows at an even stride, and statistics.
+        """
         job, block_splats, count = self.job, self.block_splats, self.job.stream.count
         part_splats = max(min(block_splats, PART_SPLATS), -(-count // MAX_PARTS))
         center, share = _sample_centers(job.stream, job.settings, -(-count // block_splats))
@@ -143,17 +147,23 @@ class InBlocks:
             ]
             self.engine.run("reading", tasks, job, self.progress)
             arrays = [job.store.get(task.name) for task in tasks]
-            summary = InputSummary.of(arrays)
-            job.settings.selection.check(summary.tally)
-            check_transformed(summary.beyond)
-            if not summary.bounds.smallest > 0:
+            tallies = [_tally_of(part) for part in arrays]
+            tally = functools.reduce(SelectionTally.then, tallies)
+            job.settings.selection.check(tally)
+            check_transformed(sum(int(part["counts"][0]) for part in arrays))
+            limits = np.stack([part["limits"] for part in arrays])
+            (*low, smallest), (*high, most) = limits[:, 0].min(axis=0).tolist(), limits[:, 1].max(axis=0).tolist()
+            if not smallest > 0:
                 raise InvalidSplatsError(INVISIBLE)
-            selected = tuple(itertools.accumulate((tally.selected for tally in summary.tallies), initial=0))
+            selected = tuple(itertools.accumulate((each.selected for each in tallies), initial=0))
             self.job = job = dataclasses.replace(job, selected=selected)
             largest = int(np.sum([np.diff(each["first"]) for each in arrays], axis=0).max())
-            again = cut_into_blocks(summary.sample[:, :3], summary.tally.selected, block_splats)
+            sample = np.concatenate([part["sample"] for part in arrays])
+            again = cut_into_blocks(sample[:, :3], tally.selected, block_splats)
             if largest <= SLACK * block_splats or job.round + 1 == ROUNDS or again == job.blocks:
-                return summary
+                statistics = [Statistics.from_array(part["statistics"]) for part in arrays]
+                bounds = Bounds(np.array(low), np.array(high), smallest, most)
+                return tally, bounds, sample, Statistics.merged(statistics)
             for part, group in itertools.product(range(len(arrays)), range(len(job.blocks.groups))):
                 job.store.remove(job.splats(part, group))
             job = dataclasses.replace(job, blocks=again, round=job.round + 1)
@@ -194,42 +204,11 @@ def _sample_centers(stream: Reader, settings: BakeSettings, blocks: int) -> tupl
     return center, len(center) / max(1, seen)
 
 
-@dataclass(frozen=True, eq=False)
-class InputSummary:
-    """Counts of the splats of an input; bounds, sample and statistics of the selected ones.
-
-    Attributes:
-        tallies: counts of selected and dropped splats, by part of the input.
-        beyond: number of splats that left the range of float32 when they were transformed.
-        sample: rows at an even stride.
-    """
-
-    tallies: Sequence[SelectionTally]
-    beyond: int
-    bounds: Bounds
-    sample: Rows
-    statistics: Statistics
-
-    @classmethod
-    def of(cls, parts: Sequence[Arrays]) -> InputSummary:
-        """Summarize one or more parts in order, from the results of `scatter`."""
-        tallies = []
-        for _, count, first, *dropped in (part["counts"].tolist() for part in parts):
-            reasons = {reason: number for reason, number in zip(REASONS, dropped, strict=True) if number}
-            tallies.append(SelectionTally(count, reasons, None if first < 0 else first))
-        limits = np.stack([part["limits"] for part in parts])
-        (*low, smallest), (*high, largest) = limits[:, 0].min(axis=0).tolist(), limits[:, 1].max(axis=0).tolist()
-        return cls(
-            tallies,
-            sum(int(part["counts"][0]) for part in parts),
-            Bounds(np.array(low), np.array(high), smallest, largest),
-            np.concatenate([part["sample"] for part in parts]),
-            Statistics.merged([Statistics.from_array(part["statistics"]) for part in parts]),
-        )
-
-    @property
-    def tally(self) -> SelectionTally:
-        return functools.reduce(SelectionTally.then, self.tallies)
+def _tally_of(part: Arrays) -> SelectionTally:
+    """Return the tally of an input part from its result of `scatter`."""
+    _, count, first, *dropped = part["counts"].tolist()
+    reasons = {reason: number for reason, number in zip(REASONS, dropped, strict=True) if number}
+    return SelectionTally(count, reasons, None if first < 0 else first)
 
 
 def scatter(job: Job, number: int, *, threads: int, progress: Progress) -> None:

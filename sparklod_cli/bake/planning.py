@@ -270,7 +270,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _opened_lock(path: Path) -> int:
-    """Create and lock the file; raise `ScratchError` if another run has locked it, or the folder has no results."""
+    """Create and lock the file; raise `ScratchError` if another run has locked it, or other files fill the folder."""
     folder = path.parent
     with contextlib.suppress(FileNotFoundError):
         if not path.exists() and any(folder.iterdir()):
