@@ -6,7 +6,6 @@ import contextlib
 import pickle
 import resource
 import signal
-import subprocess
 import sys
 import uuid
 from collections.abc import Callable, Iterator
@@ -22,7 +21,7 @@ from hypothesis.extra import numpy as arrays_of
 from sparklod_cli.bake import store as store_module
 from sparklod_cli.bake.flow import SCRATCH, scratch_folder
 from sparklod_cli.bake.identity import BakeIdentity, FileState
-from sparklod_cli.bake.planning import LOCK, MANIFEST, at_work
+from sparklod_cli.bake.planning import MANIFEST, at_work
 from sparklod_cli.bake.settings import BakeSettings
 from sparklod_cli.bake.store import Store
 from sparklod_cli.system.addresses import Address, Place
@@ -328,32 +327,6 @@ def test_a_folder_of_other_files_is_refused(store: Store, beginning: dict[str, b
     file.write_text("mine")
     refused(store, "is not a scratch folder", **beginning)
     assert file.read_text() == "mine"
-
-
-HOLDER = """
-import sys
-from pathlib import Path
-from typing import Any
-from sparklod_cli.bake.planning import locked
-with locked(Path(sys.argv[1])):
-    print("at work", flush=True)
-    sys.stdin.read()
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="there are no locks on Windows")
-def test_a_folder_in_use_is_refused_until_its_process_is_killed(store: Store) -> None:
-    command = [sys.executable, "-c", HOLDER, str(store)]
-    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == b"at work\n"
-        for beginning in BEGINNINGS:
-            refused(store, r"another run is at work in .*wait for it", **beginning)
-        assert (store.folder / LOCK).exists()
-        holder.kill()
-    with Run(store).begun():
-        pass
-    assert not Path(str(store)).exists()
 
 
 def test_scratch_folders_of_different_outputs_have_different_names(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from sparklod_cli.codecs.formats import RadOptions, WriteOptions
 from sparklod_cli.lod.tree_settings import DetailSettings
 from sparklod_cli.model.selection import Selection
 from sparklod_cli.model.transforms import Transform
-from sparklod_cli.system.errors import OutputError, UnreadableError
+from sparklod_cli.system.errors import OutputError
 from tests.conftest import FIXTURES
 
 SETTINGS = BakeSettings()
@@ -75,12 +75,6 @@ def test_each_setting_is_part_of_the_identity(scene: Path, name: str) -> None:
     assert read.digest == other.digest
 
 
-@pytest.mark.parametrize("record", [{}, [], {"inputs": 3}, {"inputs": [{}], "settings": {}}, None])
-def test_a_damaged_record_of_an_identity_is_refused(record: object) -> None:
-    with pytest.raises(ValueError, match=r"not the identity of a bake"):
-        BakeIdentity.from_record(record)
-
-
 @pytest.mark.parametrize("at", [0, 100, -1])
 def test_content_and_date_of_an_input_are_part_of_the_identity_but_not_its_name(scene: Path, at: int) -> None:
     before = BakeIdentity.of(scene, SETTINGS)
@@ -105,11 +99,6 @@ def test_colours_and_files_that_an_input_names_are_inputs(scene: Path, tmp_path:
         before = BakeIdentity.of(source, settings)
         file.write_bytes(b"two")
         assert BakeIdentity.of(source, settings).differences(before) == [f"{file} changed since"]
-
-
-def test_a_missing_input_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(UnreadableError, match="cannot be read: no such file"):
-        BakeIdentity.of(tmp_path / "none.ply", SETTINGS)
 
 
 @pytest.mark.parametrize(("name", "settings"), [("a.spz", SETTINGS), ("a.rad", CHUNKED)])
