@@ -47,19 +47,6 @@ def test_every_key_of_an_instance_is_used(scene: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("parts", "expected"),
-    [
-        ({"translation": [4, 5, 6]}, [[1, 0, 0, 4], [0, 1, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]]),
-        ({"scale": 3}, np.diag([3, 3, 3, 1])),
-        ({"scale": [3]}, np.diag([3, 3, 3, 1])),
-    ],
-)
-def test_parts_that_are_left_out_change_nothing(parts: dict[str, Any], expected: Any, scene: Path) -> None:
-    (place,) = written(scene, {"file": "a.spz"} | parts)
-    assert np.array_equal(place.object_to_world, expected)
-
-
-@pytest.mark.parametrize(
     ("keys", "expected"),
     [
         ({"cone_fov0": 90, "cone_fov": 120, "cone_foveate": 0.4, "behind_foveate": 0.2}, Cones(90, 120, 0.4, 0.2)),

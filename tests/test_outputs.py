@@ -24,7 +24,6 @@ from sparklod_cli.system import output as outputs
 from sparklod_cli.system.addresses import Address
 from sparklod_cli.system.errors import FormatError, OutputError
 from sparklod_cli.system.output import Output, check_writable, write_file
-from sparklod_cli.system.stdio import write_stdout
 from tests.conftest import FIXTURES, IS_ROOT
 from tests.part_files import put_files
 from tests.scenes import write_files
@@ -116,14 +115,6 @@ def test_concurrent_writers_of_one_name_do_not_share_a_temporary_file(tmp_path: 
 
     write_file(target, pieces(), overwrite=True)
     assert held(tmp_path) == {"out.spz": b"outer"}
-
-    def taken() -> Iterator[bytes]:
-        (tmp_path / "new.spz").write_bytes(b"another's")
-        yield b"ours"
-
-    with pytest.raises(OutputError, match="exists, add --overwrite"):
-        write_file(tmp_path / "new.spz", taken(), overwrite=False)
-    assert held(tmp_path) == {"out.spz": b"outer", "new.spz": b"another's"}
 
 
 @posix
@@ -222,11 +213,6 @@ def test_names_up_to_the_limit_of_the_file_system_are_written(length: int, tmp_p
     target = tmp_path / ("n" * (length - 4) + ".spz")
     write_file(target, [b"x"], overwrite=False)
     assert names(tmp_path) == [target.name]
-
-
-def test_standard_output_receives_the_pieces(capfdbinary: pytest.CaptureFixture[bytes]) -> None:
-    assert write_stdout([b"ab", b"\0c"]) == 4
-    assert capfdbinary.readouterr().out == b"ab\0c"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")

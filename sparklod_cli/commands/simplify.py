@@ -10,13 +10,13 @@ from typing import Any
 import click
 
 from ..codecs.formats import WRITABLE
-from ..fitting import STEPS
-from ..fitting.fit_settings import FitSettings
+from ..fitting import FIT_DEVICE_HELP, SEED, SEED_HELP, STEPS
 from ..lod.budget import Budget, doubt, parse_budget
 from ..lod.tree_settings import DETAIL_GROWTH
+from ..render import DEVICES
 from ..system.addresses import Place
 from ..system.errors import FormatError, SparklodError, naming
-from ..system.setting_fields import Quantity, Range, setting, setting_of, whole
+from ..system.setting_fields import Quantity, Range, setting, whole
 from ..system.stdio import DASH, name_of
 from ..system.units import parse_size
 from .build_lod import BY_SIZE, EXAMPLE_STEPS, QUALITY, report
@@ -71,8 +71,8 @@ class SimplifyOptions:
         is_flag=False,
         flag_value=BY_SIZE,
     )
-    seed: int = setting_of(FitSettings, "seed")
-    device: str = setting_of(FitSettings, "device")
+    seed: int = setting(SEED_HELP, SEED, 0)
+    device: str = setting(FIT_DEVICE_HELP, DEVICES, "cpu")
     output: Place = common(
         "Output, whose name chooses the format: .ply, .spz, .sog, DIR/meta.json (an unpacked SOG), .glb, .rad or"
         " .splat (without SH); DIR/ is DIR/NAME-small.spz, - is standard output, as SPZ.",
@@ -112,6 +112,7 @@ def simplify(ctx: click.Context, /, **_: Any) -> None:
     with Console(quiet=general.quiet, verbose=general.verbose) as console:
         from ..api.bake_jobs import bake_files, merged_source
         from ..bake.simplifying import SimplifyGoal
+        from ..fitting.fit_settings import FitSettings
 
         steps = options.refine
         settings = writing.settings(

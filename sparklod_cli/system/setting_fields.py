@@ -108,14 +108,6 @@ def setting(
     return field(default=default, metadata={SETTING: declared})
 
 
-def setting_of(kind: type[Any], name: str, **attributes: Any) -> Any:
-    """Return a field declared as a field of another dataclass is, with further attributes of the option."""
-    declared = next(each for each in dataclasses.fields(kind) if each.name == name)
-    own: Setting = declared.metadata[SETTING]
-    changed = dataclasses.replace(own, attributes={**own.attributes, **attributes})
-    return field(default=declared.default, metadata={SETTING: changed})
-
-
 def settings_in(kind: type[Any]) -> Iterator[tuple[dataclasses.Field[Any], Setting | None]]:
     """Yield the fields of a dataclass that are options, with their declarations, or groups of options, with None."""
     for each in dataclasses.fields(kind):

@@ -165,23 +165,6 @@ def test_help_loads_nothing_heavy(arguments: tuple[str, ...]) -> None:
     assert arguments or "sparklod_cli.commands.build_lod" not in done.stderr.split()
 
 
-#: The headings of the commands that have most options, between the common ones and the general ones.
-HEADINGS = {
-    "render": ["Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Appearance", "Comparison", "Output"],
-    "traverse": ["Inputs", "Cameras", "Cut", "Streamed SOG", "Streaming", "Output"],
-}
-
-
-@pytest.mark.parametrize("name", HEADINGS)
-def test_options_stand_under_headings_the_common_ones_first(name: str) -> None:
-    command = command_of(name)
-    groups = command.by_heading(click.Context(command))
-    assert [*groups] == [COMMON, *HEADINGS[name], GENERAL]
-    assert len(groups[COMMON]) == 11
-    general = {"--threads", "--json", "--quiet", "--verbose", "--version", "--help-all", "--help"}
-    assert {max(param.opts, key=len) for param in groups[GENERAL]} == general
-
-
 @pytest.mark.parametrize(("given", "found"), [(None, "1"), ("3", None)])
 def test_numpy_starts_no_threads_unless_a_person_asks_for_them(given: str | None, found: str | None) -> None:
     code = """

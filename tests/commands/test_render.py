@@ -18,16 +18,14 @@ from sparklod_cli.codecs.formats import ROUND_TRIPS
 from sparklod_cli.images.metrics import psnr
 from sparklod_cli.images.picture_files import THUMBNAIL_SIZE, THUMBNAIL_SUPERSAMPLE
 from sparklod_cli.images.pixels import cells
-from sparklod_cli.render.render_settings import BACKENDS, COLOR_BY, STYLES
+from sparklod_cli.render.render_settings import BACKENDS, COLOR_BY
 from sparklod_cli.render.renderer import Renderer
 from sparklod_cli.system.machine import install_hint
 from sparklod_cli.viewers import scenes
 from tests.commands.cli import NAMED, Cli, process
-from tests.conftest import FIXTURES
 
 TREE, TOWN, PLAIN, DEMO = "hand-tree-v3.spz", "town.spz", "sh2.ply", "demo.ply"
 SIZE, AT = "--size 160x90", "--look-at 0,-3,9:0,0,0"
-CAMERAS = sorted(path.name for path in (FIXTURES / "cameras").iterdir())
 
 
 def pixels(path: Path | str | io.BytesIO) -> np.ndarray:
@@ -126,12 +124,6 @@ def test_color_by_draws_a_color_scale(by: str, cli: Cli) -> None:
     assert floats("x.npy").shape == ((270, 480) if by in ("overdraw", "depth") else (270, 480, 4))
 
 
-@pytest.mark.parametrize("style", STYLES)
-def test_every_style_draws_something(style: str, cli: Cli) -> None:
-    cli(f"render {TREE} --size 64x48 -q --style {style} -o x.png")
-    assert pixels("x.png").any()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["osmesa", "open3d"])
 def test_other_backends_draw_or_name_the_missing_package(backend: str, cli: Cli) -> None:
@@ -209,13 +201,6 @@ def test_frames_of_a_path_are_its_views(cli: Cli) -> None:
         assert np.array_equal(pixels("one.png"), pixels(f"jobs1.{number:04d}.png"))
     cli(f"{line} {keys} --every 2 -o f%d.npy")
     assert [name for name in cli.made() if name[0] == "f"] == ["f0.npy", "f2.npy", "f4.npy"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CAMERAS)
-def test_every_format_of_cameras_makes_frames(name: str, cli: Cli) -> None:
-    cli(f"render {TREE} --camera-path {name} --size 64x48 -q -o out.%04d.png")
-    assert len(cli.made()) >= 3
 
 
 def test_several_views_make_a_contact_sheet(cli: Cli) -> None:
