@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cameras.camera import FARTHEST, rotation_of
-from ..codecs.formats import ENVIRONMENT, WriteOptions, folders_of
+from ..codecs.formats import ENVIRONMENT, WriteOptions
 from ..lod.tree_settings import DetailSettings, TileSettings
 from ..model.falloff import MAX_STD_DEV, MIN_ALPHA, STD_DEV_PER_D
 from ..model.gaussian import lod_opacity
@@ -107,7 +107,7 @@ def write_levels(
     levels = tuple(
         WrittenLevel(count, round(count / splats[0], 6), error) for count, error in zip(splats, worst, strict=True)
     )
-    chunks = len({*folders_of(names)} - {ENVIRONMENT})
+    chunks = len({name.partition("/")[0] for name in names if "/" in name} - {ENVIRONMENT})
     return size, WrittenDetail(levels, made.regions, chunks, 0 if environment is None else len(environment))
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Collection
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import PurePath
@@ -88,10 +87,7 @@ class Format:
 #: fewer: a .splat file begins with any float, and a .hier file with any number of splats and a float.
 FORMATS = (
     Format(
-        "compressed PLY",
-        "ply",
-        (".ply",),
-        rb"ply\s(?:(?!end_header).)*[\r\n]\s*property\s+\w+\s+packed_position\s",
+        "compressed PLY", "ply", (".ply",), rb"ply\s(?:(?!end_header).)*[\r\n]\s*property\s+\w+\s+packed_position\s"
     ),
     Format("PLY", "ply", (".ply",), rb"ply[\r\n]", (".ply",)),
     # Gzipped up to version 3.
@@ -109,14 +105,7 @@ FORMATS = (
         keys=("lodLevels",),
     ),
     Format(
-        "3D Tiles",
-        "tiles_3d",
-        (".json",),
-        None,
-        companions=True,
-        folders=True,
-        parts="tiles",
-        keys=("geometricError",),
+        "3D Tiles", "tiles_3d", (".json",), None, companions=True, folders=True, parts="tiles", keys=("geometricError",)
     ),
     # JSON with keys in any order; a meta.json of SOG is JSON, too.
     Format(
@@ -436,11 +425,6 @@ def sog_image_number(name: str) -> int | None:
     return _ALL_IMAGES.index(name) if name in _ALL_IMAGES else None
 
 
-def chunk_folder(level: int, number: int) -> str:
-    """Return the folder of a chunk of a detail level of a Streamed SOG."""
-    return f"{level}_{number}"
-
-
 def is_chunk_folder(name: str) -> bool:
     """Return whether a name is that of a folder of a Streamed SOG."""
     return name == ENVIRONMENT or _CHUNK_FOLDER.fullmatch(name) is not None
@@ -461,8 +445,3 @@ def is_of_streamed_sog(name: str) -> bool:
 def is_of_tileset(name: str) -> bool:
     """Return whether a file may belong to 3D Tiles: a tile or a nested tileset in their folder."""
     return _TILE.fullmatch(name) is not None
-
-
-def folders_of(names: Collection[str]) -> list[str]:
-    """Return the distinct folders in the paths of files, sorted."""
-    return sorted({folder for folder, mark, _ in (name.partition("/") for name in names) if mark})

@@ -22,7 +22,7 @@ from ..system.units import count_of
 from ..system.untrusted import quoted_value
 from . import quantize, sog
 from .format_rules import check_rules, error_of
-from .formats import ENVIRONMENT_FILE, MANIFEST, META, WriteOptions, chunk_folder
+from .formats import ENVIRONMENT_FILE, MANIFEST, META, WriteOptions
 from .merging import Chunk
 from .reader import OpenCompanion, OpenFile, Reader, note_of
 from .streamed_manifest import (
@@ -222,7 +222,7 @@ def _planned(scene: DetailScene, chunk_splats: int) -> list[ChunkPlan]:
         for region in range(scene.regions):
             size += int(scene.counts[region, level])
             if size > chunk_splats or (size and region == scene.regions - 1):
-                plans.append(ChunkPlan(chunk_folder(level, number), level, range(first, region + 1)))
+                plans.append(ChunkPlan(f"{level}_{number}", level, range(first, region + 1)))
                 number, first, size = number + 1, region + 1, 0
     return plans
 

@@ -15,13 +15,10 @@ import pytest
 import zstandard
 from zlib_ng import zlib_ng
 
-from sparklod_cli.codecs import compression, spz
+from sparklod_cli.codecs import compression
 from sparklod_cli.codecs.compression import BLOCK, MIXED, Inflate, Unzstd, Way
-from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.system.errors import ChecksumError, FormatError, TruncatedError
 from sparklod_cli.system.progress import silent
-from tests.codecs.cases import assert_same, decode, encode
-from tests.scenes import random_splats
 
 SIZES = (0, 1, 2, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK, 3 * BLOCK, 3 * BLOCK + 7)
 
@@ -267,17 +264,6 @@ def test_members_of_any_size_are_read_to_the_end(write: Callable[[bytes], bytes]
     """Around the bytes that are read at a time, so that a block, the end or the checksum is cut by them."""
     for size in {*range(8), *range(step - 3, step + 4), 3 * step // 2}:
         assert_reads(write(sample(size).tobytes()))
-
-
-@WITH_EACH_LIBRARY
-@pytest.mark.parametrize("splats", [100, 2_000, 40_000])
-@pytest.mark.parametrize("write", [ended_by_a_stored_block, mixed, gzip.compress], ids=lambda write: write.__name__)
-def test_a_scene_is_the_same_by_any_writer_on_any_threads(write: Callable[[bytes], bytes], splats: int) -> None:
-    made = encode(spz, random_splats(splats, sh_degree=1), WriteOptions(spz_version=2))
-    expected = decode(spz, made).splats
-    packed = write(gzip.decompress(made))
-    for threads in (1, 2, 5):
-        assert_same(decode(spz, packed, threads=threads).splats, expected)
 
 
 @WITH_EACH_LIBRARY

@@ -64,15 +64,6 @@ def test_windows_are_encoded_anywhere_and_count_what_they_clamp(
     assert not sh_degree or set(expected[0]) >= {"sh"}
 
 
-@pytest.mark.parametrize("version", [2, 3])
-def test_the_windows_of_spz_are_of_any_size(version: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = tree_of("quick", 1)
-    whole = encode(spz, scene, WriteOptions(version))
-    for size in (7, 2_000, 1 << 20):
-        monkeypatch.setattr(encoder_module, "CHUNK_NODES", size)
-        assert encode(spz, scene, WriteOptions(version)) == whole
-
-
 @pytest.mark.parametrize("options", [DEFAULTS, PALETTE])
 def test_chunk_files_are_made_of_the_results_of_windows(options: WriteOptions, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(encoder_module, "CHUNK_NODES", 1_500)
@@ -115,12 +106,6 @@ def test_labels_name_the_nearest_code(codes: int, slack: float) -> None:
 
     assert error(labels) <= error(nearest) * (1 + slack)
     assert slack or (labels == nearest).all()
-
-
-@pytest.mark.parametrize("codec", [spz, rad])
-def test_a_stream_needs_options_that_leave_nothing_open(codec: ModuleType) -> None:
-    with pytest.raises(ValueError, match="the options leave choices open"):
-        codec.encoder(node_stream(tree_of("quick", 0)), DEFAULTS)
 
 
 # --- Nodes that keep the codes of a file, bit for bit, whatever wrote them --------------------------------------------

@@ -18,7 +18,7 @@ from sparklod_cli.codecs import quantize, spz
 from sparklod_cli.codecs.formats import WriteOptions
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.lod import quick
-from sparklod_cli.model.gaussian import linear_opacity, lod_opacity, normalized_quat
+from sparklod_cli.model.gaussian import normalized_quat
 from sparklod_cli.model.scene import Scene
 from sparklod_cli.model.sh import SH_C0
 from tests.codecs.cases import assert_same, decode, encode, random_quats, rotation_degrees, stated_degrees
@@ -121,12 +121,6 @@ ENDS = {
 def test_ends_of_ranges_and_ties_have_the_codes_stated(name: str) -> None:
     values, codes = zip(*ENDS[name].items(), strict=True)
     assert BYTE_CODINGS[name][0](np.array(values, np.float32)).tolist() == [*codes]
-
-
-def test_lod_opacity_bytes_survive_being_linear() -> None:
-    """An LoD file that is read and written again keeps its alphas: the way goes through linear opacity and back."""
-    linear = linear_opacity(quantize.decode_lod_opacity(CODES))
-    np.testing.assert_array_equal(quantize.encode_lod_opacity(lod_opacity(linear)), CODES)
 
 
 # --- Spherical harmonics ----------------------------------------------------------------------------------------------

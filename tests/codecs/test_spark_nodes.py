@@ -107,12 +107,6 @@ def test_runs_of_splats_have_codings_of_their_own(scene: Scene) -> None:
     assert np.array_equal(found[20_000:], uncoded[20_000:])
 
 
-@pytest.mark.parametrize("layout", LOADED)
-def test_an_empty_tree_has_no_nodes(layout: str) -> None:
-    empty = Scene(Splats.empty(0, 0), LodTree(np.zeros(0, np.uint16), np.zeros(0, np.uint32)))
-    assert len(nodes(empty, layout, SPZ).size) == 0
-
-
 # --- The layout of Spark's traversal ----------------------------------------------------------------------------------
 
 
@@ -126,13 +120,6 @@ def test_a_node_is_four_words_of_these_bytes() -> None:
     expected = struct.pack("<4eII", 1, -2, 0.5, 1, 65535, 2**32 - 1) + struct.pack("<4eII", 1, -2, 0.5, 2.4, 0, 0)
     assert packed["lod_tree"].tobytes() == expected
     assert (list(packed), packed["lod_tree"].dtype, packed["lod_tree"].shape) == (["lod_tree"], np.uint32, (2, 4))
-
-
-def test_node_sizes_are_those_worked_out_by_hand() -> None:
-    splats = splats_with(3, scale=[0.25, 0.5, 0.75], opacity=[0.3, 1, linear_opacity(np.float32(3))])
-    np.testing.assert_allclose(gaussian.spark_size(splats), [1, 1, 2.4], rtol=1e-6)
-    sizes = layouts.unpack_nodes(layouts.pack_nodes(splats, links([0, 0, 0], [0, 0, 0]))).size
-    np.testing.assert_array_equal(sizes, np.float16([1, 1, 2.4]))
 
 
 def test_sizes_keep_and_reach_their_error() -> None:

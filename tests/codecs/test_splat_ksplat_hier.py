@@ -85,12 +85,6 @@ def test_only_the_suffix_makes_a_file_splat(suffix: str, tmp_path: Path) -> None
         read_scene(other)
 
 
-def test_a_suffix_does_not_make_another_format_of_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "scene.splat"
-    path.write_bytes((FIXTURES / "one.ply").read_bytes())
-    assert read_scene(path).format == "PLY"
-
-
 @pytest.mark.parametrize("size", [1, 31, 33, 32 * 60 - 1])
 def test_a_size_that_is_not_a_multiple_of_32_is_refused(size: int) -> None:
     with pytest.raises(FormatError, match=f"its {size:,} bytes are not a multiple of 32"):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sparklod_cli.codecs import quantize, spz
-from sparklod_cli.codecs.formats import DEFAULTS, RadOptions, WriteOptions
+from sparklod_cli.codecs.formats import DEFAULTS
 from sparklod_cli.codecs.rad import rad_writer as rad
 from sparklod_cli.codecs.statistics import (
     ALL,
@@ -65,33 +65,6 @@ def test_pieces_in_any_order_settle_as_the_whole(codec, sh_degree: int) -> None:
         rng.shuffle(parts)  # type: ignore[arg-type]
         found = Statistics.merged([Statistics.merged(parts[:3]), *parts[3:]])
         assert codec.settled(found, DEFAULTS) == codec.settled(scene, DEFAULTS)
-
-
-def test_an_array_holds_all_of_them() -> None:
-    scene = tree_of(900, 2)
-    found = Statistics.of_scene(scene)
-    assert set(found.values) == {"leaf_scale", "leaf_length", "rgb", "scale", "sh1", "sh2"}
-    array = found.array()
-    assert array.dtype == np.uint8 and array.ndim == 1 and len(array) < 100_000
-    back = Statistics.from_array(array)
-    for name, value in vars(found).items():
-        if name not in ("values", "leaf_sh"):
-            assert getattr(back, name) == value
-    np.testing.assert_array_equal(found.leaf_sh, back.leaf_sh)
-    for name, values in found.values.items():
-        for key, value in vars(values).items():
-            np.testing.assert_array_equal(getattr(back.values[name], key), value)
-    few = Statistics.from_array(Statistics.of_scene(scene, {"reach"}).array())
-    assert few.reach == float(np.abs(scene.splats.center).max()) and not few.values and few.leaf_sh is None
-
-
-def test_only_what_is_needed_is_counted() -> None:
-    settled = WriteOptions(fractional_bits=3, sh_bits=5)
-    assert spz.needed(DEFAULTS) == {"reach", "leaf_scale", "leaf_sh"} and spz.needed(settled) == {"reach"}
-    assert rad.needed(DEFAULTS) == {"rgb", "scale", "sh", "leaf_scale", "leaf_length"}
-    assert rad.needed(WriteOptions(rad=RadOptions(center="f32"))) == {"rgb", "scale", "sh", "leaf_length"}
-    scene = Scene(random_splats(50, sh_degree=1))
-    assert rad.needed(rad.settled(scene, DEFAULTS)) == frozenset()
 
 
 def test_statistics_refuse_what_the_scene_refuses() -> None:
@@ -171,12 +144,6 @@ def test_quantiles_of_merged_parts_are_off_by_less_than_a_hundredth(
     off = 0.008 * np.abs(ends) + 1e-38
     assert ends[0] - off[0] <= found.quantile(share) <= ends[1] + off[1]
     assert (found.quantile(0), found.quantile(1)) == (values.min(), values.max())
-
-
-@pytest.mark.parametrize("small", [1.0, 2.0**-149, 2.0**-126, 2.0**127, np.nextafter(np.float32(2), np.float32(0))])
-def test_powers_of_two_and_the_ends_of_float32_have_their_own_binade(small: float) -> None:
-    values = np.full(7, small, np.float32)
-    assert fine_bits(Distribution.of(values)) == bits_of(values)
 
 
 @pytest.mark.parametrize("values", [[], [0, 0, 5], [1, math.nan], [math.inf, math.inf]])
