@@ -143,7 +143,7 @@ def _tensors_of(root: Any) -> tuple[Mapping[str, Tensor], int]:
 
 
 def _others(root: Mapping[str, Any], known: Collection[str]) -> Iterator[str]:
-    """Yield the names of other tensors of the scene, or of the modules that they belong to."""
+    """Yield the names of tensors of the scene that are not `known`, or of the modules that they belong to."""
     walked = set[int]()  # a pickle may have one dict in many places
     for key, value in root.items():
         entries = value if isinstance(value, dict) else {key: value}

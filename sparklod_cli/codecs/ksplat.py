@@ -166,6 +166,7 @@ def _read(file: BinaryIO, kind: np.dtype[Any], count: int, subject: str) -> NDAr
 
 
 def _read_sections(file: BinaryIO, size: int, count: int, level: int) -> Iterator[KsplatSection]:
+    """Read the headers and buckets of all sections; checks that a file of `size` bytes can hold their rows."""
     at = HEADER.itemsize + count * SECTION.itemsize
     if at > size:
         raise TruncatedError(f"cut short: its header announces {count:,} sections")

@@ -57,7 +57,7 @@ def pack_layout(scene: Scene, encoding: str, threads: int = 1) -> Arrays:
 
 
 def _checked(arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Words]:
-    """Return arrays of uint32, C-contiguous, after a check of the shape of their rows and that all have as many rows.
+    """Check that arrays are uint32, have rows of given shapes, and as many rows each; return them C-contiguous.
 
     Raises `FormatError` if an array is missing, or has another shape or type.
     """

@@ -149,7 +149,7 @@ class LayoutLoss:
 
     @classmethod
     def total(cls, parts: Iterable[LayoutLoss]) -> LayoutLoss:
-        """Return the sums over several parts."""
+        """Add up the sums of parts of a scene."""
         every = list(parts)
         return cls(*(sum(getattr(part, name) for part in every) for name in ("weight", "ext", "packed")))
 

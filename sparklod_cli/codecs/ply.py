@@ -213,6 +213,7 @@ def first_value(file: BinaryIO, header: PlyHeader, name: str) -> float | None:
 
 
 def _skip_row(file: BinaryIO, element: PlyElement, byte_order: str) -> None:
+    """Move past a row of a binary element with lists."""
     for each in element.properties:
         if not isinstance(each, PlyListProperty):
             file.seek(np.dtype(each.dtype(byte_order)).itemsize, io.SEEK_CUR)
@@ -513,6 +514,7 @@ def _open_compressed(source: OpenFile, header: PlyHeader) -> Reader:
 
 
 def _compressed_left_out(header: PlyHeader) -> tuple[str, ...]:
+    """Return notes on the properties and elements of a compressed PLY that are ignored."""
     read = {"vertex": {*VERTEX}, "chunk": {name for names in BOUNDS.values() for name in names}}
     properties = [
         each.name

@@ -270,6 +270,7 @@ def _extensions_behind(inflate: Inflate, layout: Layout) -> Extensions:
 
 
 def _open_v4(file: BinaryIO, size: int) -> OpenStreams:
+    """Open a file of version 4; raises the errors of `open_content`."""
     head = file.read(HEADER_V4.size)
     if len(head) < HEADER_V4.size:
         raise TruncatedError("cut short inside the SPZ header")

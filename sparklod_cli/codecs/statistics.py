@@ -58,7 +58,7 @@ class Distribution:
 
     @classmethod
     def merged(cls, parts: Sequence[Distribution]) -> Distribution:
-        """Merge one distribution or more, in any order."""
+        """Merge at least one distribution; the order does not matter."""
         if len(parts) == 1:
             return parts[0]
         bins = np.concatenate([part.bins for part in parts])
@@ -271,7 +271,7 @@ class Statistics:
 
     @classmethod
     def merged(cls, parts: Sequence[Statistics]) -> Statistics:
-        """Merge the statistics of one part or more; raises ValueError if they differ in SH degree or tree."""
+        """Merge the statistics of at least one part; raises ValueError if they differ in SH degree or `tree`."""
         first = parts[0]
         if {(part.sh_degree, part.tree) for part in parts} != {(first.sh_degree, first.tree)}:
             raise ValueError("statistics of splats of several SH degrees, or of splats and nodes, cannot be merged")
@@ -287,7 +287,7 @@ class Statistics:
         )
 
     def array(self) -> NDArray[np.uint8]:
-        """Encode these statistics for `from_array`, as tens of KB."""
+        """Encode the statistics as an array of bytes, tens of KB, for `from_array`."""
         columns = {name: value for name, value in vars(self).items() if name != "values" and value is not None}
         columns |= {f"{name}.{key}": value for name, part in self.values.items() for key, value in vars(part).items()}
         file = io.BytesIO()
@@ -296,7 +296,7 @@ class Statistics:
 
     @classmethod
     def from_array(cls, array: NDArray[np.uint8]) -> Statistics:
-        """Decode the result of `array`."""
+        """Decode statistics from the result of `array`."""
         facts: dict[str, Any] = {}
         parts: dict[str, dict[str, Any]] = {}
         with np.load(io.BytesIO(array.tobytes()), allow_pickle=False) as file:
