@@ -1,6 +1,6 @@
 """Layouts in a viewer's memory: their bytes by hand, and the largest error of every field, kept and reached.
 
-`tests/interop/test_encodings.py` holds those of Spark to Spark's own words.
+`tests/interop/test_spark_files.py` holds those of Spark to Spark's own words.
 """
 
 from __future__ import annotations
