@@ -1,6 +1,6 @@
 """Nodes as Spark has them: the layout of its traversal, and nodes measured after Spark's coding, in its own arithmetic.
 
-`tests/interop/test_spark_files.py` holds them to Spark, bit for bit.
+`tests/interop/test_spark_cuts.py` holds them to Spark, bit for bit.
 """
 
 from __future__ import annotations
