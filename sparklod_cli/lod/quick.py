@@ -18,7 +18,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,9 +44,6 @@ from .kernels.sort import (
     sort_by_key,
 )
 from .tree_settings import DEFAULT_BASE, MAX_BASE, MIN_BASE
-
-if TYPE_CHECKING:
-    from .quick_stages import Margins
 
 #: Largest coordinate in steps of a level, which bounds the finest level: parts are half a step wide, and their
 #: coordinates and the differences of these are int64.
@@ -249,11 +246,11 @@ class VoxelTree:
         self._weight, self._number = np.empty(size, np.float64), np.empty(size, np.uint32)
         self._count = np.empty(size, np.uint16)
 
-    def grow(self, margins: Margins | None, progress: Progress) -> list[tuple[int, NodeRows]]:
+    def grow(self, margins: Any, progress: Progress) -> list[tuple[int, NodeRows]]:
         """Merge the nodes of each cell, level by level.
 
         Args:
-            margins: of the region, at level 0; None to merge all nodes into one root.
+            margins: `quick_stages.Margins` of the region, at level 0; None to merge all nodes into one root.
 
         Returns:
             the roots, by the level at which they join next.
