@@ -133,6 +133,16 @@ def test_the_most_bits_are_the_most_that_fit(reach: float) -> None:
     assert np.abs(back.splats.center.astype(np.float64) - splats.center).max() <= 0.5 * 2.0**-bits
 
 
+@given(log_scale=st.floats(-12, 6))
+def test_auto_is_the_fewest_bits_with_16_steps_in_a_small_splat(log_scale: float) -> None:
+    splats = spread(reach=1e-3, scale=math.exp(log_scale))  # so small that the extent sets no limit before 24
+    bits = bits_of(splats)
+    assert bits is not None
+    assert bits in (0, 24) or 16 * 2.0**-bits <= math.exp(log_scale) * 1.0001 < 16 * 2.0 ** (1 - bits) * 1.0002
+    assert bits > 0 or math.exp(log_scale) >= 16 * 0.9999
+    assert bits < 24 or math.exp(log_scale) <= 32 * 2.0**-24 * 1.0001
+
+
 def test_auto_looks_at_the_largest_scale_and_not_at_the_smallest_percent() -> None:
     flat = spread(scale=0.25)
     flat.scale[:, 2] = 1e-9
