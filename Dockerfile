@@ -1,7 +1,7 @@
 # sparklod with all kernels compiled, for every processor of a level:
 #
 #   docker build -t sparklod .                          # x86-64-v3: processors with AVX2, since about 2013 to 2015
-#   docker build -t sparklod --build-arg CPU=generic .  # any, also arm64
+#   docker build -t sparklod --build-arg CPU=x86-64 .   # any; on arm64, CPU has no effect
 #   docker build -t sparklod:cuda --build-arg EXTRAS=cuda .  # with what draws on NVIDIA cards
 #   docker run --rm --user "$(id -u):$(id -g)" -v "$PWD:/data" sparklod build-lod scene.ply
 #
@@ -17,8 +17,8 @@ FROM python:${PYTHON}-slim
 ARG CPU=x86-64-v3
 RUN useradd --create-home sparklod
 COPY --from=build /opt/sparklod /opt/sparklod
-# numba compiles for the named processor, not for the one that runs it; empty features are those that the name implies.
-ENV PATH=/opt/sparklod/bin:$PATH NUMBA_CPU_NAME=$CPU NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR=/opt/sparklod/kernels
+# Kernels are loaded for the named level, also on a better processor.
+ENV PATH=/opt/sparklod/bin:$PATH NUMBA_CPU_NAME=$CPU NUMBA_CACHE_DIR=/opt/sparklod/kernels
 USER sparklod
 WORKDIR /data
 ENTRYPOINT ["sparklod"]

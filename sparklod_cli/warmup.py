@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from .codecs.formats import RAD_SUFFIX
 from .system import jit
 from .system.errors import SparklodError
-from .system.kernel_cache import PACKAGE, KernelCache, stem_of
+from .system.machine_code import stem_of
 from .system.progress import Progress, silent
 from .system.python_process import program_command
 from .system.threads import processors
@@ -26,6 +26,14 @@ if TYPE_CHECKING:
 
 #: Seconds between updates of the progress bar.
 PATIENCE = 0.1
+
+#: Modules with kernels that Python calls, by room.
+KERNELS = {
+    "codecs": "drawable sh_clustering texels",
+    "fitting": "adam view",
+    "lod": "cell_pairs chunk_sets cut cut_statistics geometry node_rows pair_merge pixel_scale prune sort tree_links",
+    "render": "backward project raster region_errors shade",
+}
 
 #: Program of a child process.
 _PROGRAM = f"from {__name__} import _compile_requested; _compile_requested()"
@@ -45,16 +53,15 @@ class Unit(NamedTuple):
         return stem_of(self.kernel.py_func)
 
     @property
-    def is_cached(self) -> bool:
-        cache = KernelCache(self.kernel.py_func, jit.CACHE_FOLDER, jit.READ_FOLDERS, jit.report_trouble)
-        return cache.is_cached(self.kernel.signatures[self.number])
+    def is_kept(self) -> bool:
+        """Whether no run compiles it."""
+        return self.kernel.is_kept(self.number)
 
 
 def units() -> list[Unit]:
     """Return all kernels and signatures that can be compiled in advance, by module."""
     found = []
-    for path in sorted(PACKAGE.glob("*/kernels/*.py")):
-        name = ".".join([PACKAGE.name, *path.relative_to(PACKAGE).with_suffix("").parts])
+    for name in [f"{__package__}.{room}.kernels.{name}" for room, names in KERNELS.items() for name in names.split()]:
         members = vars(importlib.import_module(name)).values()
         kernels = [each for each in members if isinstance(each, jit.Kernel) and each.__module__ == name]
         found += [Unit(kernel, number) for kernel in kernels for number in range(len(kernel.declared))]
@@ -63,7 +70,7 @@ def units() -> list[Unit]:
 
 def missing() -> list[Unit]:
     """Return the `units` that are not in the cache."""
-    return [unit for unit in units() if not unit.is_cached]
+    return [unit for unit in units() if not unit.is_kept]
 
 
 def duration(count: int, processes: int = 1) -> str:
@@ -154,26 +161,26 @@ def _compile_requested() -> None:
     for line in sys.stdin:
         module, name, number = json.loads(line)
         kernel = getattr(importlib.import_module(module), name)
-        kernel.dispatcher.compile(kernel.signatures[number])
+        kernel.compile(number)
         print(flush=True)
 
 
 #: The kernels of a command's jobs that take longest to compile, in the order in which they are called.
 JOBS = {
     "quick": """
-        node_rows.fill_leaf_rows cell_pairs.merge_in_cells cell_pairs.split_families
+        node_rows.fill_leaf_rows cell_pairs.merge_in_cells cell_pairs.fill_families
         node_rows.fill_leaves node_rows.merge_colors node_rows.fill_merged_splats
     """,
     "quality": """
         node_rows.fill_leaf_rows pair_merge.merge_pairs pair_merge.find_partners
-        prune.link prune.size_ranks prune.lay_out_children
+        prune.link prune.fill_size_ranks prune.lay_out_children
         node_rows.fill_leaves node_rows.merge_colors node_rows.fill_merged_splats
     """,
     "chunks": """
-        tree_links.find_parents
+        tree_links.fill_parents
         chunk_sets.fill_demand chunk_sets.sort_within_chunks chunk_sets.split_sets
     """,
-    "levels": "tree_links.find_parents region_errors.compare_levels",
+    "levels": "tree_links.fill_parents region_errors.compare_levels",
     "cuts": "cut.find_cut cut_statistics.select cut_statistics.replace_drawn cut_statistics.measure_cut",
     "pictures": "cut.find_cut project.project raster.count_in_tiles raster.list_in_tiles raster.draw_tiles",
     "fit": "cut.find_cut project.project raster.draw_tiles adam.step backward.weigh_tiles backward.carry_back",

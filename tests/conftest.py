@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import signal
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -48,7 +47,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     from sparklod_cli.system import jit
     from sparklod_cli.system.threads import processors
 
-    _refuse_undeclared_types()
+    _call_inner_kernels()
     is_worker = hasattr(session.config, "workerinput")  # of xdist; the controlling process has compiled them
     missing = len(warmup.missing()) if jit.CACHE_FOLDER is not None and not is_worker else 0
     if not missing:
@@ -68,39 +67,26 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     terminal.write_line(f"compiled {count_of(compiled, 'kernel')} in {seconds:.0f} s", flush=True)
 
 
-def _refuse_undeclared_types() -> None:
-    """Has kernels raise an error where the package calls them with types that they do not declare.
-
-    Such a kernel would be compiled when it is called, whatever a warm-up has compiled. Tests may call them so.
-    """
-    import numba
-
+def _call_inner_kernels() -> None:
+    """Has tests call kernels that declare no types, which the package calls from kernels only; numba compiles them."""
     from sparklod_cli.system import jit
-    from sparklod_cli.system.jit import as_declared
 
     call = jit.Kernel.__call__
-    allowed = set()
+    entries: dict[jit.Kernel, Any] = {}
 
-    def checked(kernel: Any, *arguments: Any) -> Any:
-        caller = sys._getframe(1).f_globals["__name__"]
-        if caller.startswith("sparklod_cli.") and (key := (kernel, _form(arguments))) not in allowed:
-            declared = kernel.declared[0] if kernel.declared else ()
-            types = tuple(numba.typeof(as_declared(*each)) for each in zip(declared, arguments, strict=True))
-            # Of the ends of a range, the first is not declared.
-            if types not in [signature[-len(types) :] for signature in kernel.signatures]:
-                name = kernel.py_func.__name__
-                raise AssertionError(f"{caller} calls {name} with types that it does not declare: {types}")
-            allowed.add(key)
-        return call(kernel, *arguments)
+    def called(kernel: jit.Kernel, *arguments: Any) -> Any:
+        if kernel.declared:
+            return call(kernel, *arguments)
+        if kernel not in entries:
+            import numba
 
-    jit.Kernel.__call__ = checked  # type: ignore[method-assign]
+            names = ", ".join(inspect.signature(kernel.py_func).parameters)
+            namespace = {"inner": kernel.inner_on(jit.load_compiler())}
+            exec(f"def entry({names}): return inner({names})", namespace)
+            entries[kernel] = numba.njit(error_model="numpy")(namespace["entry"])
+        return entries[kernel](*arguments)
 
-
-def _form(argument: Any) -> Any:
-    """What numba's type of an argument depends on; numba takes longer to tell the type itself."""
-    if isinstance(argument, np.ndarray):
-        return argument.dtype, argument.ndim, argument.flags.num
-    return (type(argument), *map(_form, argument)) if isinstance(argument, tuple) else type(argument)
+    jit.Kernel.__call__ = called  # type: ignore[method-assign]
 
 
 @pytest.fixture(autouse=True)

@@ -171,15 +171,16 @@ def _print_kernels() -> None:
     """Import all modules of a bake, and print the state of the kernels as JSON."""
     from .. import warmup
     from ..bake.flow import bake  # noqa: F401
-    from ..system import jit
+    from ..system import jit, machine_code
 
-    jit.load_numba()
-    folder = jit.CACHE_FOLDER or next(iter(jit.READ_FOLDERS), None)
+    folder, missing = jit.CACHE_FOLDER or next(iter(jit.READ_FOLDERS), None), warmup.missing()
+    if missing or machine_code.shipped_library() is None:
+        jit.load_compiler()
     about = {
         "folder": None if folder is None else str(folder.resolve()),
         "distrusted": jit.DISTRUSTED,
         "wanted": len(warmup.units()),
-        "missing": len(warmup.missing()),
+        "missing": len(missing),
     }
     print(json.dumps(about))
 

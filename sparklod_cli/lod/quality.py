@@ -466,7 +466,9 @@ def in_final_order(
     tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
     root = np.full(hidden, len(parent) - 1, np.uint32)
     links = order, tree.child_start, tree.child_count
-    parents = prune.lay_out_children(np.concatenate([root, inner]), n, parent, saved, *links)[hidden:]
+    final = np.empty(hidden + len(inner), np.uint32)
+    prune.lay_out_children(np.concatenate([root, inner]), n, parent, saved, *links, final)
+    parents = final[hidden:]
     del parent, saved
     out = Splats.empty(total, degree_of(columns["sh"].shape[1]))
 
@@ -512,7 +514,8 @@ def _prune(
     if not goal.is_whole:
         saved[-1] += prune.ROOM
     highest = log_size[top] if goal.highest is None else np.float32(goal.highest)
-    rank = prune.size_ranks(n, highest, parent, log_size, saved, goal.latest)
+    rank = np.empty(len(parent) - n, np.int32)
+    prune.fill_size_ranks(n, highest, parent, log_size, saved, goal.latest, rank)
     binary.size = binary.error = np.empty(0, np.float32)
     return parent, saved, rank
 

@@ -49,7 +49,8 @@ class Drawing:
             by_image: (height, width, 4) float32 derivatives of the loss by premultiplied red, green, blue and by alpha.
         """
         drawn = self.drawn
-        first = backward.first_rows(drawn.boxes)
+        first = np.empty(len(drawn.boxes) + 1, np.int64)
+        backward.fill_first_rows(drawn.boxes, first)
         sums = np.empty((first[-1], backward.SUMS), np.float32)
         by_image = np.ascontiguousarray(by_image, np.float32)
         backward.weigh_tiles(len(drawn.stop), drawn, first, np.float32(MIN_ALPHA), self.image, by_image, sums)

@@ -14,6 +14,8 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
+from .errors import SparklodError
+
 #: Least number of rows for which several threads are used: with fewer, one thread finishes before another wakes up.
 #: Chosen; no difference was measured up to 65,536 (benchmarks/notes/kernels.md).
 PARALLEL_ROWS = 4096
@@ -40,8 +42,17 @@ def processors() -> int:
 
 def most_threads() -> int:
     """Return the largest number of threads that kernels run on: NUMBA_NUM_THREADS, or that of processors."""
-    given = os.environ.get("NUMBA_NUM_THREADS", "")
-    return max(int(given), 1) if given.isdecimal() else processors()
+    return given_threads() or processors()
+
+
+def given_threads() -> int | None:
+    """Return NUMBA_NUM_THREADS, None if it is empty or not set; raise `SparklodError` if it is no number of threads."""
+    given = os.environ.get("NUMBA_NUM_THREADS", "").strip()
+    if given and not (given.isdecimal() and 1 <= int(given) <= MOST_THREADS):
+        raise SparklodError(
+            f"NUMBA_NUM_THREADS is {given[:40]!r}; set it to a whole number from 1 to {MOST_THREADS:,}, or unset it"
+        )
+    return int(given) if given else None
 
 
 def thread_count(threads: int | None) -> int:

@@ -22,7 +22,7 @@ from PIL import Image
 
 from sparklod_cli.codecs.rad import rad_header
 from sparklod_cli.io.reading import read_scene
-from sparklod_cli.system.kernel_cache import SUFFIX
+from sparklod_cli.system.machine_code import SUFFIX
 from tests.conftest import FIXTURES, ROOT
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="Windows has other processes")]

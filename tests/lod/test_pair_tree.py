@@ -201,7 +201,9 @@ class Binary:
     def ranks(self) -> np.ndarray:
         """Of merged nodes."""
         highest, latest = self.log_size[-1], np.empty(0, np.int32)
-        return prune.size_ranks(self.leaves, highest, self.parent, self.log_size, self.saved, latest)
+        rank = np.empty(len(self.saved), np.int32)
+        prune.fill_size_ranks(self.leaves, highest, self.parent, self.log_size, self.saved, latest, rank)
+        return rank
 
     def place(self) -> tuple[np.ndarray, LodTree, np.ndarray, np.ndarray]:
         """The node of each final index, the tree, inner nodes and their places."""
@@ -211,8 +213,9 @@ class Binary:
         total = self.leaves + len(inner)
         order = np.full(total, UNUSED)
         tree = LodTree(np.zeros(total, np.uint16), np.zeros(total, np.uint32))
-        columns = order, tree.child_start, tree.child_count
-        places = prune.lay_out_children(inner, self.leaves, self.parent, self.saved, *columns)
+        places = np.empty(len(inner), np.uint32)
+        columns = order, tree.child_start, tree.child_count, places
+        prune.lay_out_children(inner, self.leaves, self.parent, self.saved, *columns)
         return order, tree, inner, places
 
 
@@ -293,7 +296,9 @@ def test_ranks_are_below_those_that_leaves_have_already(binary: Binary, share: f
     binary.drop(max(1, int(share * (binary.leaves - 1))))
     latest = np.random.default_rng(seed).integers(-20, 20, binary.leaves).astype(np.int32)
     terms = binary.leaves, np.float32(3), binary.parent, binary.log_size, binary.saved
-    free, bound = (prune.size_ranks(*terms, ranks) for ranks in (latest[:0], latest))
+    free, bound = np.empty((2, len(binary.saved)), np.int32)
+    prune.fill_size_ranks(*terms, latest[:0], free)
+    prune.fill_size_ranks(*terms, latest, bound)
     assert (bound <= free).all()
     rank = np.concatenate([latest, bound])
     for node in np.flatnonzero(binary.is_kept)[:-1]:

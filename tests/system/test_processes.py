@@ -18,12 +18,12 @@ from sparklod_cli import cli
 from sparklod_cli.cli import run
 from sparklod_cli.commands import installation as doctor
 from sparklod_cli.system.errors import SparklodError
-from sparklod_cli.system.kernel_cache import SUFFIX
+from sparklod_cli.system.machine_code import SUFFIX
 from sparklod_cli.system.python_process import check_current_folder, module_command, program_command
 from sparklod_cli.system.stdio import write_stdout
 from tests.conftest import FIXTURES, ROOT
 from tests.signals import heed_signals
-from tests.system.test_kernel_cache import is_whole
+from tests.system.test_machine_code import is_whole
 
 # --- Signals end a run, whatever it is doing --------------------------------------------------------------------------
 
@@ -308,7 +308,7 @@ def start_workers() -> None:
 
 def import_numba_without_forks() -> None:
     code = "import multiprocessing; multiprocessing.set_start_method('forkserver')\n"
-    code += "from sparklod_cli.system import jit; jit.load_numba()"
+    code += "from sparklod_cli.system import jit; jit.load_compiler()"
     subprocess.run(program_command(code), check=True)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -9,7 +10,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from sparklod_cli import warmup
@@ -18,7 +18,7 @@ from sparklod_cli.codecs.kernels import drawable, texels
 from sparklod_cli.commands.console import Console
 from sparklod_cli.lod.kernels import sort
 from sparklod_cli.system import jit
-from sparklod_cli.system.kernel_cache import stem_of
+from sparklod_cli.system.machine_code import stem_of
 from sparklod_cli.warmup import JOBS, CompileAhead, Unit
 from tests.conftest import FIXTURES, ROOT
 
@@ -33,15 +33,15 @@ print(json.dumps([[run(command) for command in json.loads(sys.argv[1])], compile
 """
 
 
-def test_a_call_with_types_that_are_not_declared_fails_in_tests() -> None:
-    """Thus no run of the tests calls what a warm-up does not compile; see `tests.conftest`."""
-    package: dict[str, Any] = {"__name__": "sparklod_cli.somewhere"}
-    exec("def call(kernel, *arguments): return kernel(*arguments)", package)
-    words, rest = np.zeros((3, 3), np.uint32), (np.zeros((3, 1 << 16), np.float32), np.zeros((3, 3), np.float32))
-    package["call"](texels.look_up_words, words, *rest)
-    for wrong in (words.astype(np.int32), words.T[:2], words[0]):
-        with pytest.raises(AssertionError, match="types that it does not declare"):
-            package["call"](texels.look_up_words, wrong, *rest)
+def test_all_modules_with_kernels_are_listed() -> None:
+    listed = {f"{room}/kernels/{name}" for room, names in warmup.KERNELS.items() for name in names.split()}
+    found = set()
+    for path in (ROOT / "sparklod_cli").glob("*/kernels/*.py"):
+        module = importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
+        declares = [each for each in vars(module).values() if isinstance(each, jit.Kernel) and each.declared]
+        if any(each.__module__ == module.__name__ for each in declares):
+            found.add("/".join(path.relative_to(ROOT / "sparklod_cli").with_suffix("").parts))
+    assert found == listed
 
 
 def test_commands_that_combine_much_find_all_kernels_compiled(tmp_path: Path) -> None:
@@ -95,8 +95,7 @@ def test_a_command_that_compiles_says_how_many_kernels_a_warmup_would(
     kernel = few[0].kernel
     with Console(quiet=False, verbose=False) as console:
         console.announce_compiling()
-        again = jit.Kernel(kernel.py_func, kernel.declared, ranges=kernel.ranges, options=kernel.options)
-        again.dispatcher.compile(again.signatures[0])
+        kernel.compile(0)
     first, last = capsys.readouterr().err.splitlines()
     assert first.startswith("Compiling kernels for this machine")
     assert f"sparklod warmup compiles all {len(few)} in advance" in first
@@ -113,7 +112,7 @@ def test_a_kernel_that_does_not_compile_is_named_with_the_reason(monkeypatch: py
     def absent() -> None: ...
 
     absent.__module__ = sort.__name__
-    monkeypatch.setattr(warmup, "missing", lambda: [Unit(jit.Kernel(absent, sort.split_box.options), 0)])
+    monkeypatch.setattr(warmup, "missing", lambda: [Unit(jit.Kernel(absent), 0)])
     with pytest.raises(warmup.SparklodError, match=r"sort\.absent cannot be compiled: AttributeError: .*absent"):
         warmup.warm_up(processes=1)
 
@@ -193,7 +192,7 @@ def test_a_kernel_that_is_being_compiled_is_waited_for(several_processors: list[
         unit = ahead._current
     assert unit is not None
     ahead.claim(unit.kernel)
-    assert unit.is_cached
+    assert unit.is_kept
     ahead.close()
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...system.jit import f4, kernel
+from ...system.jit import f4, i8, kernel
 
 #: The largest finite float32.
 LARGEST = np.finfo(np.float32).max
 
 
-@kernel(f4[:], f4[:], f4[:], f4[:], f4[:], f4[:], f4, nogil=True)
+@kernel(f4[:], f4[:], f4[:], f4[:], f4[:], f4[:], f4, returns=(i8, i8))
 def count_doubtful(center, scale, quat, opacity, rgb, sh, tolerance):
     """Count the tests of validity that splats fail, and the splats without opacity or scale.
 

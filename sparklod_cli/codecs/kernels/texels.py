@@ -10,7 +10,7 @@ _BYTE = np.uint32(255)
 _8, _16, _24 = np.uint32(8), np.uint32(16), np.uint32(24)
 
 
-@kernel(u4[:], out(u1[:, :]), i8, nogil=True)
+@kernel(u4[:], out(u1[:, :]), i8)
 def place_bytes(pixels, out, place):
     """Put red, green and blue into byte `place` of each of the three words of (N, 12) bytes."""
     for i in range(len(pixels)):
@@ -20,7 +20,7 @@ def place_bytes(pixels, out, place):
         out[i, 8 + place] = p & _BYTE
 
 
-@kernel(u4[:, :], f4[:, :], out(f4[:, :]), nogil=True)
+@kernel(u4[:, :], f4[:, :], out(f4[:, :]))
 def look_up_words(words, tables, out):
     """Fill (N, 3) float32 by (3, 65536) tables and the lower halves of (N, 3) uint32, which may be the same memory."""
     for i in range(len(words)):
@@ -28,7 +28,7 @@ def look_up_words(words, tables, out):
             out[i, axis] = tables[axis, words[i, axis] & np.uint32(0xFFFF)]
 
 
-@kernel(u4[:], u4[:], f4[:, :], out(f4[:, :]), nogil=True)
+@kernel(u4[:], u4[:], f4[:, :], out(f4[:, :]))
 def look_up(pixels, shifts, tables, out):
     """Fill (N, C) float32 by (C, 256) tables and the bytes of (N,) pixels at (C,) bit `shifts`."""
     for i in range(len(pixels)):
@@ -36,7 +36,7 @@ def look_up(pixels, shifts, tables, out):
             out[i, k] = tables[k, pixels[i] >> shifts[k] & _BYTE]
 
 
-@kernel(u4[:], f4[:], out(f4[:, :]), nogil=True)
+@kernel(u4[:], f4[:], out(f4[:, :]))
 def fill_quats(pixels, components, out):
     """Fill (N, 4) quaternions x y z w; `components` has the value of each of 256 codes.
 
@@ -68,7 +68,7 @@ def fill_quats(pixels, components, out):
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = x, y, z, w
 
 
-@kernel(u4[:], f4[:, :], out(f4[:, :]), nogil=True)
+@kernel(u4[:], f4[:, :], out(f4[:, :]), returns=i8)
 def gather_rows(pixels, rows, out):
     """Fill `out` (N, D) with the rows of labels, red + 256 * green, unless one is beyond the last row.
 

@@ -12,8 +12,10 @@ vectorizes over nodes; results do not depend on the spans.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...system.fast_math import exp2
 from ...system.jit import b1, f4, i8, kernel, out, u4
@@ -289,16 +291,27 @@ def merge_in_cells(start, stop, nodes, is_first, rows, largest, made, owner, row
             merge_span(nodes, is_first, rows, largest, begin, end, made, owner, row)
 
 
-@kernel(u4[:], i8[:], u4[:])
-def split_families(nodes, owner, row):
+def split_families(
+    nodes: NDArray[Any], owner: NDArray[Any], row: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Separate the members of families from the roots; `owner` and `row` are of `merge_in_cells`.
 
     Returns:
-        members: (C,) members, family after family, in the order of the first members.
+        members: (C,) uint32 members, family after family, in the order of the first members.
         first: (F + 1,) int64, where each family begins in `members`.
-        made: (F,) rows of the parents of the families.
-        survivors: (S,) the roots: a parent replaces the first member of its family.
+        made: (F,) uint32 rows of the parents of the families.
+        survivors: (S,) uint32, the roots: a parent replaces the first member of its family.
     """
+    n = len(nodes)
+    members, first = np.empty(n, np.uint32), np.empty(n // 2 + 1, np.int64)
+    made, survivors = np.empty(n // 2, np.uint32), np.empty(n, np.uint32)
+    used, families, left = fill_families(nodes, owner, row, members, first, made, survivors)
+    return members[:used], first[: families + 1], made[:families], survivors[:left]
+
+
+@kernel(u4[:], i8[:], u4[:], out(u4[:]), out(i8[:]), out(u4[:]), out(u4[:]), returns=(i8, i8, i8))
+def fill_families(nodes, owner, row, members, first, made, survivors):
+    """Fill the arrays of `split_families`; return the lengths of `members`, `made` and `survivors`."""
     n = len(nodes)
     size = np.zeros(n, np.int64)
     for i in range(n):
@@ -311,8 +324,7 @@ def split_families(nodes, owner, row):
             begin[i] = used
             used += size[i]
             families += 1
-    members, first = np.empty(used, np.uint32), np.zeros(families + 1, np.int64)
-    made, survivors = np.empty(families, np.uint32), np.empty(left, np.uint32)
+    first[0] = 0
     family = survivor = 0
     for i in range(n):
         own = owner[i]
@@ -326,4 +338,4 @@ def split_families(nodes, owner, row):
                 family += 1
                 first[family] = first[family - 1] + size[i]
             survivor += 1
-    return members, first, made, survivors
+    return used, families, left

@@ -117,7 +117,7 @@ def put(cut, at, node, limit, instance):
 FIRST_STEP = np.float32(1 / 8)
 
 
-@kernel(Trees, Stop, f4, out(Slots), out(f4[:]), out(CutNodes), nogil=True)
+@kernel(Trees, Stop, f4, out(Slots), out(f4[:]), out(CutNodes), returns=(i8, i8, i8, f4, i8))
 def find_cut(trees, stop, guess, slots, demand, cut):
     """Find the cut: refine the node with the largest pixel scale while it is above `stop.smallest` and within budget.
 
@@ -168,7 +168,7 @@ def find_cut(trees, stop, guess, slots, demand, cut):
         bucket = stopping_bucket(trees, slots, stop.budget, low, bucket)
 
 
-@kernel(nogil=True)
+@kernel()
 def sum_from_top(slots, low):
     """Replace `slots.sums` above bucket `low` by the size of the cut that refines this bucket and all larger ones."""
     total = slots.first[0]
@@ -177,7 +177,7 @@ def sum_from_top(slots, low):
         slots.sums[bucket] = total
 
 
-@kernel(nogil=True)
+@kernel()
 def stopping_bucket(trees, slots, budget, low, below):
     """Return the next bucket below `below` in which the budget may end: that of a node with missing children, or `low`.
 
@@ -198,7 +198,7 @@ def stopping_bucket(trees, slots, budget, low, below):
     return found
 
 
-@kernel(nogil=True)
+@kernel()
 def collect(trees, stop, slots, demand, cut, low):
     """Collect the nodes of the cut that refines the buckets above `low`, but not `low` itself.
 
@@ -254,7 +254,7 @@ def collect(trees, stop, slots, demand, cut, low):
     return selected, queued, missing, small, least
 
 
-@kernel(nogil=True)
+@kernel()
 def finish(trees, stop, slots, demand, cut, low, collected):
     """Add the nodes of bucket `low`, refined in the order of the queue, to the nodes of `collect`.
 
@@ -363,7 +363,7 @@ LEAST_POWER, MOST_POWER = 0.5, 4.0
 BEYOND = 0.98
 
 
-@kernel(nogil=True)
+@kernel()
 def visit_roots(trees, stop, slots):
     """Put the resident roots into the slots; return the bits of the largest limit."""
     nodes, views, resident, _ = trees
@@ -386,7 +386,7 @@ def visit_roots(trees, stop, slots):
     return largest
 
 
-@kernel(nogil=True)
+@kernel()
 def refine(trees, stop, slots, threshold):
     """Refine the nodes with a limit above a threshold, in memory order; update `slots.tally`.
 
@@ -462,7 +462,7 @@ def refine(trees, stop, slots, threshold):
     tally[DRAWN], tally[LOW] = drawn, low
 
 
-@kernel(nogil=True)
+@kernel()
 def lowered(slots, threshold, budget):
     """Return the next threshold, whose cut probably has slightly more than `budget` nodes.
 
@@ -494,7 +494,7 @@ def comes_before(node, limit, instance, a, b):
     return node[a] > node[b]
 
 
-@kernel(nogil=True)
+@kernel()
 def sift_up(node, limit, instance, heap, at):
     """Move the heap's entry at `at` up to restore the order of the heap."""
     while at > 0:
@@ -505,7 +505,7 @@ def sift_up(node, limit, instance, heap, at):
         at = above
 
 
-@kernel(nogil=True)
+@kernel()
 def sift_down(node, limit, instance, heap, length):
     """Move the heap's first entry down to restore the order of the heap."""
     at = 0

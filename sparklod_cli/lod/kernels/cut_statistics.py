@@ -38,7 +38,7 @@ class Screen(NamedTuple):
     area: Any  # square pixels, float64; no splat covers more
 
 
-@kernel(NODES, i4[:], VIEWS, CutNodes, Screen, out(i8[:, :]), out(f4[:]), out(u2[:]), nogil=True)
+@kernel(NODES, i4[:], VIEWS, CutNodes, Screen, out(i8[:, :]), out(f4[:]), out(u2[:]), returns=i8)
 def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
     """Count the nodes of a cut inside, outside and behind the frustum, and measure those inside; return their number.
 
@@ -95,7 +95,7 @@ def measure_cut(nodes, depths, views, cut, screen, counts, sizes, owners):
     return found
 
 
-@kernel(nogil=True)
+@kernel()
 def measure_block(x, y, z, size, count, view, screen):
     """Replace (BLOCK_NODES,) sizes by feature sizes in pixels; -1 for splats with centres not inside the frustum.
 
@@ -127,7 +127,7 @@ def measure_block(x, y, z, size, count, view, screen):
     return inside, behind, area
 
 
-@kernel(f4[:], i8[:], out(f4[:]), nogil=True)
+@kernel(f4[:], i8[:], out(f4[:]))
 def select(values, places, found):
     """Fill the order statistics of values, all at least 0, at ascending places."""
     # Values are counted in buckets by the upper halves of their bits; only the requested buckets are sorted.
@@ -154,7 +154,7 @@ def select(values, places, found):
         found[entry] = some[places[entry] - first]
 
 
-@kernel(out(u4[:]), out(u4[:]), i8[:], u4[:], u2[:], u4[:], u2[:], out(i8[:, :]), nogil=True)
+@kernel(out(u4[:]), out(u4[:]), i8[:], u4[:], u2[:], u4[:], u2[:], out(i8[:, :]))
 def replace_drawn(drawn, before, base, node, instance, old_node, old_instance, counts):
     """Fill (instances, 2) counts: the nodes of a cut, and the nodes shared with the cut before.
 

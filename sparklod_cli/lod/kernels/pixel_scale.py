@@ -105,7 +105,7 @@ def pixel_scale(node, view):
     return scale
 
 
-@kernel(NODES, i8[:], VIEWS, i8, out(f4[:]), nogil=True)
+@kernel(NODES, i8[:], VIEWS, i8, out(f4[:]))
 def pixel_scales(nodes, index, views, number, scales):
     """Fill the absolute pixel scales of nodes `index` of one tree; NaN becomes infinity, as in the order of cuts."""
     view = views[number]

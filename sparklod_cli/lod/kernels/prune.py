@@ -144,7 +144,7 @@ def count_by_key(begin, end, kept, leaves, children, log_size, lost, weight, sav
                 counts[block, key] += 1
 
 
-@kernel(i8, i8, i8, i8, u4[:], f4[:], f4[:], out(u4[:]), out(u2[:]), out(f4[:]), out(i4[:]))
+@kernel(i8, i8, i8, i8, u4[:], f4[:], f4[:], out(u4[:]), out(u2[:]), out(f4[:]), out(i4[:]), returns=i8)
 def drop_below(threshold, most, leaves, children, parent, log_size, weight, kept, keys, lost, saved):
     """Drop at most `most` nodes whose keys are no larger than a threshold; return how many.
 
@@ -207,15 +207,15 @@ def usefulness(node, leaves, parent, log_size, lost, weight, saved):
     return span * (np.float32(saved[node]) - lost[node]) * weight[node]
 
 
-@kernel(i8, f4, u4[:], f4[:], i4[:], i4[:])
-def size_ranks(leaves, highest, parent, log_size, saved, latest):
-    """Return (T - leaves,) int32 ranks of merged nodes in the final order, NO_RANK for dropped nodes.
+@kernel(i8, f4, u4[:], f4[:], i4[:], i4[:], out(i4[:]))
+def fill_size_ranks(leaves, highest, parent, log_size, saved, latest, rank):
+    """Fill (T - leaves,) ranks of merged nodes in the final order, NO_RANK for dropped nodes.
 
     A rank is the number of size steps below `highest`, the ln(size) of rank 0; it is above the parent's. `latest` is
     empty, or has an upper bound, exclusive, of the rank of each leaf's parent.
     """
     total = len(parent)
-    rank = np.full(total - leaves, NO_RANK, np.int32)
+    rank[:] = NO_RANK
     per_unit = np.float32(STEPS / math.log(2))
     for node in range(total - 1, leaves - 1, -1):
         if saved[node - leaves] != -1:
@@ -233,20 +233,17 @@ def size_ranks(leaves, highest, parent, log_size, saved, latest):
                 continue
             above = parent[node] - leaves
             rank[above] = min(rank[above], own - 1)
-    return rank
 
 
-@kernel(u4[:], i8, u4[:], i4[:], out(u4[:]), out(u4[:]), out(u2[:]))
-def lay_out_children(inner, leaves, parent, saved, order, child_start, child_count):
+@kernel(u4[:], i8, u4[:], i4[:], out(u4[:]), out(u4[:]), out(u2[:]), out(u4[:]))
+def lay_out_children(inner, leaves, parent, saved, order, child_start, child_count, final):
     """Assign final indices: the root is 0, siblings are consecutive, and come in the order of their parents.
 
     Args:
         inner: (I,) the merged nodes that are kept, parents before their children.
         order: (M,) filled with the node of each final index.
         child_start, child_count: columns of a `LodTree` of M nodes, filled.
-
-    Returns:
-        (I,) uint32 final indices of `inner`.
+        final: (I,) filled with the final indices of `inner`.
     """
     total = len(parent)
     start = np.zeros(total - leaves, np.uint32)  # final index of a node's next child
@@ -264,10 +261,8 @@ def lay_out_children(inner, leaves, parent, saved, order, child_start, child_cou
             if node >= leaves:
                 index[node - leaves] = start[above]
             start[above] += 1
-    final = np.empty(len(inner), np.uint32)
     for i in range(len(inner)):
         own = inner[i] - leaves
         final[i] = index[own]
         child_count[final[i]] = saved[own] + 1
         child_start[final[i]] = start[own] - (saved[own] + 1)
-    return final

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,10 +185,18 @@ def fill_level_keys(begin, end, center, scale, steps, grid, low, cell_bits, keys
         keys[i] = morton_code(x, y, z, grid, low, np.uint64(0)) | (np.uint64(level) << np.uint64(cell_bits))
 
 
-@kernel(u4[:], f4[:, :], f4[:], f4[:])
-def split_box(nodes, geometry, below, above):
+def split_box(
+    nodes: NDArray[Any], geometry: NDArray[Any], below: NDArray[Any], above: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the nodes with centres between corners, (3,) `below` and `above`, and the other nodes, in their order."""
     inside, outside = np.empty(len(nodes), np.uint32), np.empty(len(nodes), np.uint32)
+    count = fill_box(nodes, geometry, below, above, inside, outside)
+    return inside[:count], outside[: len(nodes) - count].copy()
+
+
+@kernel(u4[:], f4[:, :], f4[:], f4[:], out(u4[:]), out(u4[:]), returns=i8)
+def fill_box(nodes, geometry, below, above, inside, outside):
+    """Fill the arrays of `split_box` from the start; return the number of nodes inside."""
     n = m = 0
     for i in range(len(nodes)):
         x, y, z = geometry[nodes[i], 0], geometry[nodes[i], 1], geometry[nodes[i], 2]
@@ -197,4 +206,4 @@ def split_box(nodes, geometry, below, above):
         else:
             outside[m] = nodes[i]
             m += 1
-    return inside[:n], outside[:m].copy()
+    return n

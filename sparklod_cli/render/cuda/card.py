@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...system.errors import BackendError, optional_import
-from ...system.jit import load_numba
+from ...system.jit import load_compiler
 
 #: An array on the card, as numba has it.
 CardArray = Any
@@ -41,7 +41,7 @@ class Card:
 
 def find_card() -> Card:
     """Return the card that numba uses; a BackendError says in one line why none can be used."""
-    load_numba()
+    load_compiler()
     with optional_import("--device cuda needs numba-cuda", "cuda", BackendError):
         from numba import cuda
     from ...system.jit_cuda import SIMULATED

@@ -76,16 +76,14 @@ class Drawn(NamedTuple):
     across: Any  # number of tiles in a row of them
 
 
-@kernel(i2[:, :])
-def first_rows(boxes):
-    """Return (N + 1,) int64 where the rows of each splat begin, one for each tile that its box overlaps."""
-    first = np.empty(len(boxes) + 1, np.int64)
+@kernel(i2[:, :], out(i8[:]))
+def fill_first_rows(boxes, first):
+    """Fill (N + 1,) places where the rows of each splat begin, one for each tile that its box overlaps."""
     total = 0
     for i in range(len(boxes)):
         first[i] = total
         total += max(0, boxes[i, 1] - boxes[i, 0] + 1) * max(0, boxes[i, 3] - boxes[i, 2] + 1)
     first[len(boxes)] = total
-    return first
 
 
 @kernel(inline=True)
@@ -175,7 +173,7 @@ def weigh_tiles(begin, end, drawn, first, least, image, by_image, sums):
     """Sum for each splat over the pixels of each tile that its box overlaps.
 
     Args:
-        first: of `first_rows`.
+        first: of `fill_first_rows`.
         least: least alpha that is drawn.
         image: (height, width, 4) of `draw_tiles`.
         by_image: (height, width, 4) derivatives of the loss by it.
@@ -196,7 +194,8 @@ def weigh_tiles(begin, end, drawn, first, least, image, by_image, sums):
             out[:] = 0
             if entry >= drawn.stop[tile]:
                 continue
-            row[:] = drawn.screen[i]
+            for k in range(COLUMNS):
+                row[k] = drawn.screen[i, k]
             measure(row, left, top, rows, columns, lines)
             for block in range(BLOCKS):
                 top_line, bottom_line = np.int64(lines[block, 0]), np.int64(lines[block, 1])
@@ -218,7 +217,7 @@ class Rows(NamedTuple):
     """Splats on the screen, and their sums, tile by tile."""
 
     screen: Any  # (N, COLUMNS) float32 of `project`
-    first: Any  # (N + 1,) int64 of `first_rows`
+    first: Any  # (N + 1,) int64 of `fill_first_rows`
     sums: Any  # (first[-1], SUMS) float32 of `weigh_tiles`
 
 

@@ -1,4 +1,4 @@
-"""The cache of compiled kernels: whom it trusts, and damage, full disks and folders that vanish."""
+"""Machine code as files: names, trust, damage, full disks, folders that vanish, and what comes with the package."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
-from sparklod_cli.system import jit, kernel_cache
+from sparklod_cli.system import jit, machine_code
 from sparklod_cli.system.jit import f8
-from sparklod_cli.system.kernel_cache import CHECKSUM, SUFFIX, cache_folders, is_trusted, start_of
+from sparklod_cli.system.machine_code import CHECKSUM, SUFFIX, cache_folders, is_trusted, name_of, needed_by
 from sparklod_cli.warmup import units
 from tests.conftest import ROOT
 
@@ -58,7 +58,7 @@ class Cache:
     def compiles(self, argument: float = 2.0) -> bool:
         """Calls `twice` as in a new process; whether it had to be compiled."""
         before = len(self.begun)
-        assert jit.kernel(f8)(twice)(argument) == argument * 2
+        assert jit.kernel(f8, returns=f8)(twice)(argument) == argument * 2
         return len(self.begun) > before
 
 
@@ -71,36 +71,36 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cache]:
     jit.listeners.pop()
 
 
-def test_code_compiled_for_another_processor_is_not_used(cache: Cache) -> None:
-    cache.compiles()
-    start = start_of(twice)
-    assert list(cache.folder.glob(f"{start}-*"))
-    code = "from sparklod_cli.system.kernel_cache import start_of; from tests.system.test_kernel_cache import twice"
-    for changed, same in (({}, True), ({"NUMBA_NUM_THREADS": "1"}, True), ({"NUMBA_CPU_NAME": "generic"}, False)):
-        command, environment = [sys.executable, "-c", f"{code}; print(start_of(twice))"], {**os.environ, **changed}
-        other = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
-        assert other.stdout.startswith("test_kernel_cache.twice-")
-        assert (other.stdout.strip() == start) == same
-
-
-def test_code_for_a_named_processor_is_used_on_every_machine() -> None:
+def level(flags: frozenset[str], tmp_path: Path, **variables: str) -> str:
+    """The level of a processor with some flags, in a new process."""
+    (tmp_path / "cpuinfo").write_text(f"processor: 0\nflags\t\t: fpu {' '.join(flags)} sse2\n")
     code = """
-import sys
-from llvmlite import binding
-if len(sys.argv) > 1:
-    binding.get_host_cpu_name = lambda: sys.argv[1]
-    binding.get_host_cpu_features = lambda: binding.FeatureMap({sys.argv[1]: True})
-from sparklod_cli.system import fast_math, kernel_cache
-print(kernel_cache.start_of(fast_math.exp2.py_func))
+import pathlib, sys
+read = pathlib.Path.read_text
+pathlib.Path.read_text = lambda path: read(pathlib.Path(sys.argv[1]) if str(path) == "/proc/cpuinfo" else path)
+from sparklod_cli.system import machine_code
+machine_code.PLATFORM = "linux-x86_64"
+print(machine_code.level())
 """
+    command, environment = [sys.executable, "-c", code, str(tmp_path / "cpuinfo")], {**os.environ, **variables}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
 
-    def start(*machine: str, **variables: str) -> str:
-        command, environment = [sys.executable, "-c", code, *machine], {**os.environ, **variables}
-        return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True).stdout
 
-    named = {"NUMBA_CPU_NAME": "x86-64-v3", "NUMBA_CPU_FEATURES": ""}
-    assert start(**named) == start("another", **named) != start("another")
-    assert start() != start("another")
+def test_machine_code_is_for_the_best_level_of_the_processor_or_a_lower_one_that_is_named(tmp_path: Path) -> None:
+    best, middle = needed_by("x86-64-v3"), needed_by("x86-64-v2")
+    assert level(best, tmp_path) == level(best, tmp_path, NUMBA_CPU_NAME="nosuchcpu") == "x86-64-v3"
+    assert level(best - {"fma"}, tmp_path) == level(best, tmp_path, NUMBA_CPU_NAME="x86-64-v2") == "x86-64-v2"
+    assert level(middle, tmp_path, NUMBA_CPU_NAME="x86-64-v3") == "x86-64-v2"
+    assert level(middle - {"ssse3"}, tmp_path) == level(best, tmp_path, NUMBA_CPU_NAME="x86-64") == "x86-64"
+
+
+def test_variables_of_numba_that_can_change_the_code_change_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = name_of(twice, 0)
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
+    assert name_of(twice, 0) == name
+    monkeypatch.setenv("NUMBA_OPT", "1")
+    assert name_of(twice, 0) not in (name, name_of(twice, 1))
 
 
 # --- Trust ------------------------------------------------------------------------------------------------------------
@@ -108,12 +108,11 @@ print(kernel_cache.start_of(fast_math.exp2.py_func))
 
 def test_the_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "given"))
-    given = cache_folders(Path(jit.__file__))[0]
+    given = cache_folders()[0]
     assert given is not None
     assert given.parent == tmp_path / "given"
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/dev/null/no/folder")
-    assert cache_folders(Path(jit.__file__)) == (None, (), ())
-    assert cache_folders(Path(jit.__file__).parent / "not-there.py") == (None, (), ())  # as in a zip
+    assert cache_folders() == (None, (), ())
 
 
 posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
@@ -123,14 +122,14 @@ posix = pytest.mark.skipif(os.name != "posix", reason="POSIX only")
 @pytest.mark.parametrize("mode", [0o777, 0o775, 0o707])
 def test_a_folder_that_others_can_write_is_not_used(mode: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    folder = cache_folders(Path(jit.__file__))[0]
+    folder = cache_folders()[0]
     assert folder is not None
     folder.chmod(mode)
-    written, read, (message,) = cache_folders(Path(jit.__file__))
+    written, read, (message,) = cache_folders()
     assert (written, read) == (None, ())
     assert message.startswith(f"compiled code in {folder} is not used: another user owns it or can write it")
     folder.chmod(0o755)
-    assert cache_folders(Path(jit.__file__)) == (folder, (), ())
+    assert cache_folders() == (folder, (), ())
 
 
 @posix
@@ -144,7 +143,7 @@ def test_what_another_user_owns_is_not_trusted(
     os.chown(tmp_path / "file", owner, owner)
     monkeypatch.setattr(os, "geteuid", lambda: user)
     assert is_trusted((tmp_path / "file").stat()) is trusted
-    monkeypatch.setattr(kernel_cache, "PACKAGE", tmp_path / "package")
+    monkeypatch.setattr(machine_code, "PACKAGE", tmp_path / "package")
     (tmp_path / "package").mkdir()
     os.chown(tmp_path / "package", owner, owner)
     assert is_trusted((tmp_path / "file").stat())
@@ -157,7 +156,7 @@ def test_a_new_folder_is_readable_by_others_only_if_the_superuser_made_it(
     for user, mode in ((0, 0o755), (os.geteuid() or 7, 0o700)):
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / str(user)))
         monkeypatch.setattr(os, "geteuid", lambda user=user: user)
-        cache_folders(Path(jit.__file__))
+        cache_folders()
         (folder,) = (tmp_path / str(user)).iterdir()
         assert folder.stat().st_mode & 0o777 == mode
 
@@ -182,40 +181,24 @@ def test_a_cache_that_can_only_be_read_is_read(cache: Cache, monkeypatch: pytest
     monkeypatch.setattr(jit, "READ_FOLDERS", (cache.folder,))
     before = cache.files()
     assert not cache.compiles()
-    assert cache.compiles(2)  # another signature, which is stored nowhere
     assert (cache.files(), cache.told) == (before, [])
 
 
 @posix
 def test_a_folder_that_cannot_be_written_is_read_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    folder = cache_folders(Path(jit.__file__))[0]
+    folder = cache_folders()[0]
     assert folder is not None
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    assert cache_folders(Path(jit.__file__)) == (None, (folder,), ())
+    assert cache_folders() == (None, (folder,), ())
 
 
 # --- Damage -----------------------------------------------------------------------------------------------------------
 
 
-def test_memory_that_runs_out_is_no_damage(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
-    cache.compiles()
-    before = cache.files()
-
-    def starved(*arguments: object) -> None:
-        raise MemoryError
-
-    monkeypatch.setattr("sparklod_cli.system.kernel_cache.pickle.loads", starved)
-    with pytest.raises(MemoryError):
-        cache.compiles()
-    assert cache.told == []
-    assert cache.files() == before
-
-
 def test_a_second_process_finds_what_the_first_has_compiled(cache: Cache) -> None:
     assert [cache.compiles(), cache.compiles()] == [True, False]
-    assert cache.compiles(2)  # another signature, in files of its own
-    assert len(cache.files()) == 2
+    assert len(cache.files()) == 1
     assert cache.told == []
 
 
@@ -229,33 +212,6 @@ def test_damaged_files_are_told_of_and_compiled_again(cache: Cache, damage: Call
     before = len(cache.told)
     assert not cache.compiles()
     assert len(cache.told) == before == 1
-
-
-@pytest.mark.parametrize("damage", [None, *DAMAGE.values()], ids=["none", *DAMAGE])
-def test_a_caller_is_compiled_with_what_is_stored_of_the_kernels_in_it(
-    cache: Cache, damage: Callable[[bytes], bytes] | None
-) -> None:
-    def fourfold() -> float:
-        inner = jit.kernel()(twice)
-
-        def outer(x: float) -> float:
-            result: float = inner(inner(x))
-            return result
-
-        found: float = jit.kernel(f8)(outer)(2.0)
-        return found
-
-    assert fourfold() == 8
-    (path,) = cache.folder.glob("*.twice-*")
-    content = path.read_bytes()
-    if damage is not None:
-        path.write_bytes(damage(content))
-    for caller in cache.folder.glob("*.outer-*"):
-        caller.unlink()
-    assert fourfold() == 8
-    assert len(cache.told) == (damage is not None)
-    assert is_whole(path.read_bytes())
-    assert (path.read_bytes() == content) == (damage is None)
 
 
 def test_a_folder_that_takes_no_file_is_told_of_and_does_no_harm(cache: Cache, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,7 +238,7 @@ def test_a_command_heals_a_cache_in_which_every_file_is_damaged(tmp_path: Path) 
     copy.mkdir(parents=True)
     for unit in units():
         if unit.name.partition(".")[0] == "tree_links":  # those of inspect
-            for path in jit.CACHE_FOLDER.glob(f"{start_of(unit.kernel.py_func)}-*{SUFFIX}"):
+            for path in [jit.CACHE_FOLDER / f"{name_of(unit.kernel.py_func, unit.number)}{SUFFIX}"]:
                 shutil.copy(path, copy)
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     scene = ROOT / "fixtures" / "sh1-ascii.ply"
@@ -303,3 +259,44 @@ def test_a_command_heals_a_cache_in_which_every_file_is_damaged(tmp_path: Path) 
     again = subprocess.run(command, **how)
     assert "damaged" not in again.stderr
     assert "ompil" not in again.stderr
+
+
+# --- What comes with the package --------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(shutil.which("cc") is None or sys.platform == "win32", reason="no linker")
+def test_machine_code_that_is_shipped_is_used_unless_its_source_differs(
+    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert cache.compiles()
+    objects = [tmp_path / path.name for path in cache.files()]
+    for path, copy in zip(cache.files(), objects, strict=True):
+        copy.write_bytes(path.read_bytes()[CHECKSUM:])
+    library = tmp_path / f"{machine_code.PLATFORM}-{machine_code.level()}.so"
+    subprocess.run(["cc", "-shared", "-o", library, *objects, "-lm"], check=True)
+    monkeypatch.setattr(machine_code, "SHIPPED", tmp_path)
+    monkeypatch.setattr(jit, "CACHE_FOLDER", None)
+    machine_code.shipped_library.cache_clear()
+    try:
+        assert not cache.compiles()
+        monkeypatch.setattr(machine_code, "digest_of", lambda path: "another")
+        assert cache.compiles()
+    finally:
+        machine_code.shipped_library.cache_clear()
+
+
+def test_a_package_in_a_zip_finds_its_sources(tmp_path: Path) -> None:
+    """Without them, code of another version would be taken for its own."""
+    shutil.make_archive(str(tmp_path / "package"), "zip", ROOT, "sparklod_cli")
+    code = """
+from pathlib import Path
+from sparklod_cli.lod.kernels import sort
+from sparklod_cli.system import machine_code
+print(machine_code.PACKAGE.parent.name, machine_code.name_of(sort.fill_box.py_func, 0))
+"""
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "package.zip")}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    from sparklod_cli.lod.kernels import sort
+
+    assert done.stdout.split() == ["package.zip", name_of(sort.fill_box.py_func, 0)]
