@@ -81,7 +81,11 @@ class BuiltTree:
 
 
 def output_of(target: Place, settings: BakeSettings, *, overwrite: bool) -> BuiltTree:
-    """Return a tree to be built, with its output; raise `OutputError` now, before the work."""
+    """Prepare the output of a bake, and return the tree that is to be built.
+
+    Raises:
+        OutputError: the output cannot be written, or it exists and `overwrite` is False.
+    """
     options = settings.options
     if settings.detail is not None or settings.tiles is not None:
         return BuiltTree(settings=settings, out=parts_output(target, overwrite=overwrite), options=options)

@@ -63,11 +63,12 @@ def count_outside(
     steps: NDArray[np.float64] | float = 0.0,
     directions: NDArray[np.float64] | None = None,
 ) -> int:
-    """Count the splats whose ellipsoids of one standard deviation reach out of a bound.
+    """Count the splats whose ellipsoids of one standard deviation extend beyond a bounding box.
 
     Args:
         bound: (2, 3) lowest and highest coordinates along the directions.
-        steps: (3,) steps of the codes of centres, as shares of the distance from the origin plus 1.
+        steps: (3,) quantization steps of centres, as logarithms: half of exp(step) - 1, times 1 plus the distance from
+            the origin, is tolerated.
         directions: (3, 3) unit vectors along the sides of the bound as rows; None for the axes.
     """
     loose, step = LOOSE_BOUND * np.abs(bound[1] - bound[0]), np.maximum(LOOSE_CENTER, np.expm1(steps) / 2)

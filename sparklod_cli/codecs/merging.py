@@ -348,7 +348,7 @@ class ZipFolder:
 
 
 def _first_file(names: list[str]) -> str:
-    """Return the name of the one file that names the others, which is not below another such file."""
+    """Return the name of the topmost file that lists others, such as lod-meta.json; an error if there is not one."""
     above = {MANIFEST: (), META: (MANIFEST,), TILESET: (TILESET,)}
     paths = {path: name for name in names if (path := PurePosixPath(name)).name in above}
     found = [

@@ -72,17 +72,18 @@ def visible_weight(splats: Splats) -> Weights:
 def cluster(
     sh: FloatArray, codes: int, *, weight: ArrayLike | None = None, threads: int | None = 1, progress: Progress = silent
 ) -> ShPalette:
-    """Find a palette for the coefficients of splats, the same for any number of threads.
+    """Cluster the SH coefficients of splats into a palette of at most `codes` entries.
 
-    If at most `codes` rows differ, the palette holds just these, exactly. Otherwise rows get nearly the nearest codes:
-    their total squared error is about 1 % larger than with the nearest.
+    The result does not depend on the number of threads. With at most `codes` distinct rows, the palette holds exactly
+    these. Otherwise each row gets an entry by an approximate search for the nearest one, whose total squared error is
+    about 1 % above that of an exact search.
 
     Args:
         sh: (N, K, 3) finite float32 coefficients, K at least 1.
-        codes: largest number of codes, 1 to `formats.MAX_SH_CODES`.
+        codes: largest number of entries, 1 to `formats.MAX_SH_CODES`.
         weight: (N,) weights of the squared errors of rows, finite and at least 0; None for equal weights.
         threads: number of threads; None for all processors.
-        progress: receives the number of cells, and then the passes of k-means.
+        progress: receives the number of cells into which rows were split, and then the passes of k-means.
 
     Raises:
         ValueError: a coefficient is not finite.

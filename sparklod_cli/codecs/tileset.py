@@ -83,7 +83,7 @@ class TileRecord:
 
     @property
     def name(self) -> str | None:
-        """Path of its content from the folder of the first tileset file on; None without content."""
+        """Path of the content, relative to the folder of the root tileset; None if there is no content."""
         if self.uri is None:
             return None
         path = urllib.parse.unquote(self.uri)

@@ -346,7 +346,7 @@ def _check(ctx: click.Context, options: BuildLodOptions) -> tuple[Form, str, Seq
 
 
 def _output_of(options: BuildLodOptions, form: Form, source: Place, folder: Place | None) -> Place:
-    """Return the output for an input, in a folder or else beside it."""
+    """Return the path of the output for an input, in a folder or else beside it."""
     stem = stem_of(source)
     if form.manifest or ((options.form is not None or options.refine is not None) and source.suffix.lower() in TREES):
         stem = stem.removesuffix("-lod")  # a tree in another format has its name

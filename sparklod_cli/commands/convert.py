@@ -65,12 +65,12 @@ class ConvertOptions:
 def convert(ctx: click.Context, /, **_: Any) -> None:
     """Write the splats or the tree of IN in the format that the name of OUT chooses.
 
-    Reads all that build-lod reads. A Level-of-Detail file keeps its tree as .spz and .rad; as .ply, .sog, .glb, .splat
-    or DIR/meta.json (an unpacked SOG), and with --leaves, its leaves are written. Splats are selected, turned and moved
-    as build-lod does it; a tree is not. IN and OUT may be -, standard input and output, or addresses such as
-    s3://bucket/scan.ply (extra cloud).
+    Reads all that build-lod reads. The tree of a Level-of-Detail file is kept if OUT is .spz or .rad; all other formats
+    (.ply, .sog, .glb, .splat, and DIR/meta.json, an unpacked SOG) get its leaves, and so do .spz and .rad with
+    --leaves. Splats are selected, turned and moved as by build-lod; a tree is not. IN and OUT may be -, standard input
+    and output, or addresses such as s3://bucket/scan.ply, which need the extra cloud.
 
-    --layout writes arrays as viewers have them in memory.
+    --layout writes the arrays that a viewer has in memory instead of a splat file.
     """
     choice = ctx.params["form"]
     if isinstance(ctx.params["output"], Folder) and choice is None:

@@ -355,7 +355,7 @@ def mean_psnr(nodes: FittedNodes, cut: Callable[[Camera], Index], compared: Sequ
 
 
 def gain(before: Scores, after: Scores) -> float:
-    """Return the mean gain over all shares, dB."""
+    """Return the mean gain of PSNR over all budgets, dB."""
     return float(np.mean([after[share] - before[share] for share in before]))
 
 

@@ -74,7 +74,10 @@ class LeafCoding:
 
 
 def codings_of(scene: Scene, leaves: Splats, original: Splats, facts: RadFacts | None) -> Iterator[LeafCoding | str]:
-    """Yield codings in which the leaves could be equal to `original`, the most likely first, or why there is none."""
+    """Yield the encodings that may have turned `original` into the leaves, the most likely first.
+
+    An encoding that cannot be imitated is a string, which says why.
+    """
     if facts is None:
         yield from (of_spz(scene, leaves, covering=covering) for covering in (True, False))
         return

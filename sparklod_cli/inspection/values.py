@@ -323,7 +323,7 @@ class ValueTally:
 
     @classmethod
     def total(cls, parts: Iterable[ValueTally]) -> ValueTally:
-        """Add the tallies of all blocks, in order."""
+        """Return the sum of the tallies of blocks, in their order."""
         every = list(parts)
         return cls(
             merged(part.by_name for part in every),
@@ -335,7 +335,13 @@ class ValueTally:
 
 
 def findings_about(tallied: Tallies, ends: Ends, *, merged_splats: bool) -> list[Finding]:
-    """Return findings about the values of all splats of a file, `ValueTally.by_name`, some of which may be merged."""
+    """Return findings about the values of all splats of a file.
+
+    Args:
+        tallied: tallies of `ValueTally.by_name`.
+        ends: ends of the ranges of stored values.
+        merged_splats: whether the file can hold merged splats, whose opacity may be above 1.
+    """
     if not tallied["all"].count:
         return [Finding("values.empty", "there are no splats")]
     findings: list[Finding] = []

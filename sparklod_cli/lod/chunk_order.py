@@ -188,7 +188,12 @@ def _ranks(center: FloatArray, threads: int) -> NDArray[np.int32]:
 
 
 def _sequence(families: Families, filled: int, total: int, progress: Progress) -> Index:
-    """Return the (F,) families of a part in their final order, which begins after `filled` of `total` nodes."""
+    """Return the order of the (F,) families of a part in the file.
+
+    Args:
+        filled: number of nodes before the part.
+        total: number of nodes of the tree, for the progress.
+    """
     length, own = len(families.count), int(families.count.sum(dtype=np.int64))
     sequence = np.arange(length, dtype=np.int32)
     set_of, root, spare = (np.full(length, -1, np.int32) for _ in range(3))

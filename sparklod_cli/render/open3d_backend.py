@@ -350,7 +350,7 @@ class Painter:
         self._material.gaussian_splat_antialias = True
 
     def probe(self) -> None:
-        """Draw a splat, because Open3D silently draws nothing without a Vulkan device; then raise `RuntimeError`."""
+        """Draw a splat; raise `RuntimeError` if nothing is drawn, as Open3D does without a Vulkan device."""
         splat = np.array([[0.0, 0.0, 1.0, 0.2, 0.2, 0.2, 1.0, 0.0, 0.0, 0.0, 9.0, -1.7, 1.7, -1.7]], np.float32)
         request = {
             "side": 32,

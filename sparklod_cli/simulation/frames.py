@@ -287,7 +287,13 @@ def measure(forest: Forest, cut: TreeCut, view: Camera, *, by_instance: bool = F
 
 
 def _measured(row: NDArray[np.int64], sizes: NDArray[np.float32], pixels: int) -> Row:
-    """Return the statistics of a row of counts, `kernels.COUNTS`, and of the projected sizes of its splats."""
+    """Return the statistics of a cut for a row of the table.
+
+    Args:
+        row: counts, see `kernels.COUNTS`.
+        sizes: projected sizes of the splats inside the frustum, pixels.
+        pixels: number of pixels of the picture.
+    """
     selected, leaves, frontier, in_frustum, outside, behind, least, levels, most, area = row.tolist()
     percentiles: list[float | None] = [None, None]
     if len(sizes):  # interpolated linearly between two sizes each

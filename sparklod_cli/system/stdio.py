@@ -75,9 +75,9 @@ class _GuardedStream:
 
 
 def reserve() -> None:
-    """Open the descriptors of closed standard streams, so that no other file gets them, and the output of libraries.
+    """Open placeholders on closed standard descriptors (0, 1, 2), so that files opened later do not get these numbers.
 
-    In Python they remain closed, as they were at startup.
+    Otherwise what libraries print would end up in such a file. `sys.stdin`, `sys.stdout` and `sys.stderr` stay None.
     """
     while True:
         descriptor = os.open(os.devnull, os.O_RDWR)

@@ -250,7 +250,7 @@ class LoadedScene:
         return len(self.leaves)
 
     def rows(self, index: Index) -> Splats:
-        """Return some splats, in the space of the scene, by their indices, ascending and each once."""
+        """Return the splats with strictly ascending indices, in the space of the scene."""
         return self.splats if len(index) == self.count else self.splats.take(index)
 
     def chunk_of(self, index: Index) -> NDArray[np.int64]:

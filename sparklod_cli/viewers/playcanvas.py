@@ -468,7 +468,7 @@ def _file(files: DetailFiles, level: Levels) -> NDArray[np.int64]:
 
 
 def _finer(chains: Chains, level: Levels) -> Levels:
-    """Return the (R,) levels of chains that are next finer than (R,) levels; -1 for none."""
+    """Return for each of R chains the next finer level than a given one, (R,) `level`; -1 if there is none."""
     below = (chains.level < level[:, None]) & (chains.level >= 0)
     last = below.shape[1] - 1 - np.argmax(below[:, ::-1], axis=1)
     return np.where(below.any(axis=1), chains.level[np.arange(len(level)), last], -1)

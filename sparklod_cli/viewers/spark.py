@@ -80,7 +80,12 @@ class SparkViewer:
             pages.read(np.flatnonzero(wanted[chunks] & ~pages.present).tolist())
 
     def _cut(self, view: Camera, budget: int, smallest: float, present: NDArray[np.bool_]) -> TreeCut:
-        """Return the cut with (chunks,) bool resident chunks, which are in memory."""
+        """Return the cut of a view that uses the resident chunks only.
+
+        Args:
+            smallest: pixel-scale limit.
+            present: (chunks,) whether each chunk is resident.
+        """
         start = time.perf_counter()
         views = views_of(self.forest, self.instances, view)
         trees = cut.Trees(self._nodes, views, present, CHUNK_BITS)

@@ -314,7 +314,10 @@ class RadEncoder:
         return b"".join([pack_chunk_header(header), *payload])
 
     def keeping(self, stored: Sequence[StoredChunk], unchanged: NDArray[np.bool_]) -> RadEncoder:
-        """Return an encoder that keeps the stored codes of (N,) `unchanged` nodes if the encoding is the same."""
+        """Return an encoder that copies the codes of (N,) `unchanged` nodes from `stored` chunks.
+
+        Properties that `stored` has in another encoding are encoded again.
+        """
         return dataclasses.replace(self, stored=stored, unchanged=unchanged)
 
     def _coded(
