@@ -98,7 +98,7 @@ def inspect_file(
 
 
 def picture_of(scene: Scene | None, by: str, depth: int | None) -> tuple[DescribedPicture | None, str | None]:
-    """Draw the structure of a scene, see `scene_plots.plot`; return the picture, or the reason why there is none."""
+    """Draw the structure of a scene, see `scene_plots.plot`; return the picture, or why it cannot be drawn."""
     if scene is None:
         return None, "it does not hold all of its splats, so they cannot be drawn"
     from ..images import scene_plots

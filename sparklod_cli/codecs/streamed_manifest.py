@@ -77,7 +77,7 @@ class ManifestNode:
         bound: lowest and highest corner in world units; None if it is missing, or not finite.
         children: numbers of the child nodes, ascending; empty for a region.
         runs: runs of a region by detail level; None if the node has no `lods`.
-        errors: unchecked value of a region; None if there is none.
+        errors: unchecked value of the key `errors` of a region; None if the key is missing.
         parent: number of the parent, -1 for the root.
     """
 

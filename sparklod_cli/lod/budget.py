@@ -86,7 +86,7 @@ def parse_budget(text: str) -> Budget:
 
 
 def parse_budgets(text: str) -> tuple[Budget, ...]:
-    """Parse budgets such as "2%,5%,500k"; raise `ValueError` if one is invalid, or there is none."""
+    """Parse budgets such as "2%,5%,500k"; raise `ValueError` for an invalid budget, and for an empty list."""
     if GROUPED_LIST.search(text):
         check_grouping(text)
     budgets = tuple(map(parse_budget, filter(None, map(str.strip, text.split(",")))))

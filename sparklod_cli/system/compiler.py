@@ -22,8 +22,8 @@ from numba.extending import intrinsic
 
 from .machine_code import level
 
-#: Functions that stand for numba's and Python's in machine code. Memory is that of C. An error in a kernel, such as
-#: memory that cannot be had, ends in `PyErr_WriteUnraisable`; the C function returns what is in @failure then.
+#: Functions that replace numba's and Python's in machine code. They allocate by `malloc`. An error in a kernel, such as
+#: a failed allocation, ends in `PyErr_WriteUnraisable`, and the C function then returns the value of @failure.
 RUNTIME = """
 @failure = global i64 0
 

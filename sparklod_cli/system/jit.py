@@ -157,7 +157,7 @@ class Kernel:
         ranges: Python calls it for ranges of rows, see `kernel`.
         options: keyword arguments of `numba.njit`.
         inner: numba's dispatcher, which other kernels call; None until it is needed.
-        codes: the functions of C by number of signature, of those that are loaded.
+        codes: loaded C functions by the number of their signature.
     """
 
     def __init__(

@@ -77,10 +77,9 @@ _IMPORT = re.compile(rb"^from (\.+)([\w.]*) import (\([^)]*\)|[^\n#]*)", re.MULT
 # --- Names ------------------------------------------------------------------------------------------------------------
 
 
+@functools.cache
 def _source(path: Path) -> bytes | None:
-    """Read a module, which may be in a zip; None if there is no such module or only its bytecode."""
-    if path.is_file():
-        return path.read_bytes()
+    """Read a module, which may be in a zip; None for a missing module, and for one without source."""
     loader: Any = sys.modules[__name__].__spec__.loader  # type: ignore[union-attr]
     try:
         content: bytes = loader.get_data(str(path))
@@ -89,18 +88,29 @@ def _source(path: Path) -> bytes | None:
     return content
 
 
+@functools.cache
+def _imported_by(path: Path) -> tuple[Path, ...]:
+    """Return the paths of modules of the package that a module imports."""
+    modules = list[Path]()
+    for dots, module, names in _IMPORT.findall(_source(path) or b""):
+        base = path.parents[len(dots) - 1].joinpath(*module.decode().split(".") if module else ())
+        whole = base.with_suffix(".py")
+        if _source(whole) is not None:
+            modules.append(whole)
+        else:  # a package, of which names can be modules
+            modules += [base / f"{name.decode()}.py" for name in re.findall(rb"\w+", names)]
+    return tuple(modules)
+
+
 def sources_of(*paths: Path) -> Mapping[Path, bytes]:
     """Return the sources that the kernels of modules depend on: their own, and those of all that they import."""
     sources, left = dict[Path, bytes](), [*paths]
     while left:
         path = left.pop()
         content = None if path in sources or path in _WITHOUT_INFLUENCE else _source(path)
-        if content is None:
-            continue
-        sources[path] = content
-        for dots, module, names in _IMPORT.findall(content):
-            base = path.parents[len(dots) - 1].joinpath(*module.decode().split(".") if module else ())
-            left += [base.with_suffix(".py"), *(base / f"{name.decode()}.py" for name in re.findall(rb"\w+", names))]
+        if content is not None:
+            sources[path] = content
+            left += _imported_by(path)
     return sources
 
 
@@ -210,7 +220,7 @@ def is_trusted(status: os.stat_result) -> bool:
 
 
 def read(name: str, folders: Sequence[Path], trouble: Trouble) -> bytes | None:
-    """Return the object file of that name in the first folder that has it; None if there is none, or a damaged one."""
+    """Return the object file of that name from the first folder that has it; None if it is missing or damaged."""
     for folder in folders:
         path = folder / f"{name}{SUFFIX}"
         with contextlib.suppress(OSError):
@@ -248,7 +258,7 @@ def write(name: str, content: bytes, folder: Path, trouble: Trouble) -> None:
 
 @functools.cache
 def shipped_library() -> ctypes.CDLL | None:
-    """Load the shared library that came with the package for this kind of processor; None if there is none."""
+    """Load the shared library of the package for this kind of processor; None if the package has none."""
     path = SHIPPED / f"{PLATFORM}-{level()}.so"
     try:
         return ctypes.CDLL(str(path)) if path.is_file() else None
@@ -257,7 +267,7 @@ def shipped_library() -> ctypes.CDLL | None:
 
 
 def shipped(name: str) -> int | None:
-    """Return the address of machine code that came with the package; None if there is none of that name."""
+    """Return the address of a kernel in the shared library of the package; None if the library lacks it."""
     library = shipped_library()
     if library is None:
         return None

@@ -179,7 +179,7 @@ def _shown(path: Path, folder: str) -> ShownFile:
 
 
 def _note(name: str, head: bytes, header: RadHeader | None) -> str | None:
-    """Return the reason, visible in the first bytes of a file, why Spark will not show it; None if there is none."""
+    """Return the reason, visible in the first bytes of a file, why Spark will not show it; None if Spark may."""
     for beginning, what in UNREAD:
         if re.match(beginning, head):
             return f"{name}: Spark 2.2.0 does not read {what}; bake it first with sparklod build-lod"
